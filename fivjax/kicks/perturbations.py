@@ -1,8 +1,8 @@
 r"""Perturbations of steady sliding whose smallest size is sought: initial states, and histories of the load.
 
-Both are vectors $u$ with a norm. While the contact slides under constant friction, both change the two quantities that end
-sliding (normal force and slip speed) linearly: the change at the time $t$ is $κ(t) · u$. So no $u$ with a norm below the margin
-over $\sup_t |κ(t)|_*$, in the dual norm, ever ends sliding. The supremum is bounded between instants, too.
+Both are vectors $u$ with a norm. While all contacts slide under constant friction, both change the quantities that end
+sliding (normal forces and slip speeds) linearly: the change at the time $t$ is $κ(t) · u$. So no $u$ with a norm below the
+margin over $\sup_t |κ(t)|_*$, in the dual norm, ever ends sliding. The supremum is bounded between instants, too.
 """
 
 from typing import NamedTuple, Protocol
@@ -17,7 +17,7 @@ from ..foundation.kept_programs import kept
 from ..kernels.functions import KernelFunction
 from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
-from ..model.sliding import sliding_states
+from ..model.sliding import contact_coordinates, sliding_states
 from ..section.about_sliding import mechanics_about_sliding
 from ..section.crossings import MOST_SEGMENTS, ByMethod
 from ..steppers.core import follow
@@ -43,13 +43,21 @@ class Certificate(NamedTuple):
     shapes: Vectors
 
 
+class Margin(NamedTuple):
+    """A quantity of a contact that ends sliding where it falls to zero, and how far it is from that in steady sliding."""
+
+    shares: Complex[np.ndarray, " k"]  # of the modes in it
+    size: float  # m/s of slip; of pressing as in `LinearSliding`
+    presses: bool  # whether it is pressing, which the load changes at once, too
+
+
 class StableSliding(NamedTuple):
     """The sliding motion of one scene in modal coordinates."""
 
     modes: SlidingModes
     linear: LinearSliding
     shift: Complex[np.ndarray, " k"]  # shift of the equilibrium by the load, in modal coordinates
-    signals: tuple[tuple[np.ndarray, float], ...]  # shares of the modes in slip and in pressing, and their margins
+    margins: list[Margin]  # of slip and of pressing, of each contact
 
 
 class Perturbation(Protocol):
@@ -85,10 +93,19 @@ def stable_sliding(scene: Scene) -> StableSliding:
         raise ValueError("Argument `scene` must slide steadily and stably, or no kick is needed to make it squeal.")
     own: SlidingModes = jax.tree.map(lambda leaf: leaf[0], modes)
     linear = own.linear
-    states = sliding_states(scene.structure.size, scene.structure.normal)
-    shift = np.asarray(own.to_modal) @ np.asarray(linear.equilibrium)[states].astype(complex)
-    signals = (own.slip, float(linear.slip_margin)), (own.pressing, float(linear.pressing_margin))
-    return StableSliding(own, linear, shift, signals)
+    shift = np.asarray(own.to_modal) @ np.asarray(linear.equilibrium)[_free_states(scene)].astype(complex)
+    of_contacts = (own.slip, linear.slip_margin, False), (own.pressing, linear.pressing_margin, True)
+    margins = [
+        Margin(shares, float(size), presses)
+        for every, sizes, presses in of_contacts
+        for shares, size in zip(np.atleast_2d(every), np.atleast_1d(sizes), strict=True)
+    ]
+    return StableSliding(own, linear, shift, margins)
+
+
+def _free_states(scene: Scene) -> np.ndarray:
+    """Places in a state of the coordinates that sliding leaves free, and of their velocities."""
+    return sliding_states(scene.structure.size, contact_coordinates(scene.structure)[1])
 
 
 @kept
@@ -97,12 +114,10 @@ def _linear(scene: Scene) -> LinearSliding:
 
 
 class InitialStates:
-    """Deviations from sliding of a contact that stays closed; the norm is the square root of their energy, in √J."""
+    """Deviations from sliding of contacts that stay closed; the norm is the square root of their energy, in √J."""
 
     def __init__(self, scene: Scene):
-        self.scene, n = scene, scene.structure.size
-        self.sliding = stable_sliding(scene)
-        self.places = sliding_states(n, scene.structure.normal)
+        self.scene, self.sliding, self.places = scene, stable_sliding(scene), _free_states(scene)
         free = self.places[: len(self.places) // 2]
         energy = np.zeros((2 * len(free), 2 * len(free)))
         energy[: len(free), : len(free)] = np.asarray(scene.structure.stiffness)[np.ix_(free, free)]
@@ -135,7 +150,7 @@ class InitialStates:
         growth = max(float(np.max(np.linalg.eigvalsh(0.5 * (inner + inner.T)))), 0.0)
         step = 2 * np.pi / (COARSE * np.max(np.abs(rates)))
         size, shapes = np.inf, []
-        for shares, margin in self.sliding.signals:
+        for shares, margin, _ in self.sliding.margins:
             rows = np.asarray(shares)[:, None] * to_modal
             sizes, vectors = _later(rows, rates, step, 0.0, lambda rows: np.linalg.norm(rows, axis=-1))
             size = min(size, margin / (float(np.max(sizes)) * np.exp(growth * step)))
@@ -179,11 +194,11 @@ class Histories:
         count = int(np.ceil(FINE * fastest * self.time / (2 * np.pi * self.pieces)))
         inside = np.linspace(0.0, self.time / self.pieces, count + 1)
         size, shapes = np.inf, []
-        for row, (shares, margin) in enumerate(self.sliding.signals):
+        for shares, margin, presses in self.sliding.margins:
             own = np.asarray(shares) * self.sliding.shift
             steady = float(np.real(np.sum(own)))
             # The direct effect of the load on the normal force, while it lasts.
-            direct = margin - steady if row == 1 else 0.0
+            direct = margin - steady if presses else 0.0
 
             def response(t, own=own, jump=direct + steady):
                 """The response to a load that is doubled at t = 0."""
@@ -267,7 +282,8 @@ def _at_end(args, _):
         after = follow(how.method, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
         return (after.y, after.contact), None
 
-    sliding = Contact(jnp.asarray(Status.SLIDE, jnp.int32), jnp.sign(scene.belt_speed))
+    direction = jnp.sign(scene.belt_speed)
+    sliding = Contact(jnp.full(direction.shape, Status.SLIDE, jnp.int32), direction)
     return jax.lax.scan(piece, (jnp.zeros(2 * n), sliding), factors)[0][0], ()
 
 

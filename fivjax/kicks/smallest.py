@@ -1,8 +1,8 @@
 r"""The smallest kick found that leads to squeal, and a bound below which every kick is proved to slide.
 
-While the contact slides under constant friction the motion is linear. With $A$ its state matrix and $z_∞$ the shift of the
+While all contacts slide under constant friction the motion is linear. With $A$ its state matrix and $z_∞$ the shift of the
 equilibrium by the load itself, the deviation during a kick is $(p - 1)(1 - e^{At}) z_∞$, and after one of duration $d$ it is
-$(p - 1) e^{A(t - d)} (1 - e^{Ad}) z_∞$. No contact event happens while slip speed and normal force stay positive, and both
+$(p - 1) e^{A(t - d)} (1 - e^{Ad}) z_∞$. No contact event happens while slip speeds and normal forces stay positive, and both
 are affine in the deviation. Let $P(d)$ be a bound on the change of one of them over the whole future after a kick with
 $p - 1 = 1$ (the bound that verdicts use, `envelope_peak`). Then every kick with $p - 1$ below the least ratio of margin to
 $P(d)$, over all durations, slides for ever. Between two durations $h$ apart, $P$ is at most the larger value plus $h L / 2$,
@@ -24,7 +24,7 @@ from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
 from ..maps.groups import OF_KICK
 from ..model.load import Pulse
-from ..model.scene import Scene, refuse_several_contacts
+from ..model.scene import Scene
 from ..verdicts.sliding_proof import envelope_peak
 from .critical import critical_perturbation
 from .perturbations import stable_sliding
@@ -141,7 +141,6 @@ def smallest_kick(
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
-    refuse_several_contacts(scene.structure, "`smallest_kick`")
     if not scene.friction.constant:
         raise ValueError("Argument `scene` must have constant friction: the bound is that of a linear sliding motion.")
     bounds = arguments.bounds_by_name("bounds", {} if bounds is None else bounds, '"p": (1.0, 2.0)')
@@ -259,7 +258,7 @@ def _excess_by_duration(scene: Scene, durations: np.ndarray) -> np.ndarray:
     # A kick of zero duration causes no motion.
     with np.errstate(divide="ignore"):
         reached = [
-            margin / _peaks(shapes * (shares * sliding.shift), modes.envelope) for shares, margin in sliding.signals
+            margin / _peaks(shapes * (shares * sliding.shift), modes.envelope) for shares, margin, _ in sliding.margins
         ]
     return np.min(reached, axis=0)
 
@@ -270,10 +269,10 @@ def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
     sliding = stable_sliding(scene)
     rates, modal, envelope = sliding.modes.eigenvalues, sliding.shift, sliding.modes.envelope
     least = np.inf
-    for row, (shares, margin) in enumerate(sliding.signals):
+    for shares, margin, presses in sliding.margins:
         steady = float(np.real(np.sum(shares * modal)))
         # The direct effect of the load on the normal force: in the static limit, the force is proportional to the load.
-        direct = margin - steady if row == 1 else 0.0
+        direct = margin - steady if presses else 0.0
         slope = float(_peaks(shares * rates * modal, envelope)[0])
         during = np.linspace(0.0, longest, GRID)
         response = direct + steady - np.real(np.exp(np.outer(during, rates)) @ (shares * modal))

@@ -12,6 +12,7 @@ from fivjax.kicks.smallest import certified_excess
 from fivjax.model.sliding import sliding_states
 from tests.helpers import reference
 from tests.helpers.general_coordinates import TURN, in_general_coordinates
+from tests.helpers.several_contacts import copies, scene_of
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 
@@ -29,6 +30,35 @@ def test_below_the_certified_bound_no_kick_has_an_event_and_a_fifth_above_one_ha
 def test_the_bound_grows_with_the_belt_speed_while_it_is_slip_that_ends():
     assert certified_excess(SCENE.replace(belt_speed=0.5), 0.1, 0.1) == pytest.approx(
         0.5 * certified_excess(SCENE, 0.1, 0.1), rel=1e-12
+    )
+
+
+# Two oscillators that know nothing of each other, of which the first carries half the load.
+ALONE = SCENE.replace(mu=0.2, belt_speed=0.5)
+PAIR = scene_of(copies(2, shares=[0.5, 1.0]), mu=0.2, belt=0.5, p=1.2)
+
+
+def test_bounds_of_several_contacts_are_those_of_the_one_that_ends_first():
+    assert certified_excess(PAIR, 0.02, 0.1) == pytest.approx(certified_excess(ALONE, 0.02, 0.1), rel=1e-6)
+    for kind in (InitialStates, lambda scene: Histories(scene, 4, 0.02)):
+        with jax.enable_x64(True):
+            loaded, less, both = (kind(scene).certificate().size for scene in (ALONE, ALONE.replace(force=50.0), PAIR))
+        # As far as the steps between instants, which follow the fastest mode of both, let the bounds be equal.
+        assert both == pytest.approx(min(loaded, less), rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("over", [("p",), ("p", "duration"), "state", "history"])
+def test_the_smallest_of_several_contacts_is_that_of_the_one_that_needs_least(over):
+    settings = {"over": over, "p_step": 0.05, "progress": False}
+    both, alone, less = (fj.smallest_kick(scene, **settings) for scene in (PAIR, ALONE, ALONE.replace(force=50.0)))
+    if isinstance(over, tuple):
+        assert both.p == pytest.approx(alone.p, abs=1e-9) and both.duration == pytest.approx(alone.duration, rel=1e-6)
+        assert both.certified == pytest.approx(alone.certified, abs=1e-7)
+        return
+    least = alone if alone.size < less.size else less
+    assert both.size == pytest.approx(least.size, rel=1e-4) and both.certified == pytest.approx(
+        least.certified, rel=1e-5
     )
 
 
