@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 import fivjax as fj
-from tests.helpers.several_contacts import copies
+from tests.helpers.several_contacts import coupled
 
 P = (1.0, 4.0)
 
@@ -44,16 +44,6 @@ def with_appendages(size: int) -> fj.Structure:
         for matrix, value in ((stiffness, rate**2), (damping, 0.04 * rate)):
             matrix[np.ix_([at, own], [at, own])] += 1e-3 * value * np.array([[1.0, -1.0], [-1.0, 1.0]])
     return fj.Structure(mass, damping, stiffness, np.pad(load, (0, more)), tangential=0, normal=2)
-
-
-def coupled(count: int) -> fj.Structure:
-    """Copies of the paper's oscillator under different shares of the load, neighbours held together firmly along the belt."""
-    structure = copies(count, shares=1 + 0.1 * np.arange(count))
-    mass, damping, stiffness, load = (np.array(matrix) for matrix in structure.matrices)
-    for k in range(count - 1):
-        for matrix, value in ((stiffness, 1e6), (damping, 200.0)):
-            matrix[np.ix_([3 * k, 3 * k + 3], [3 * k, 3 * k + 3])] += value * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    return fj.Structure(mass, damping, stiffness, load, contacts=structure.contacts)
 
 
 def cost(scene: fj.Scene, mu, p) -> tuple[float, int, str]:

@@ -27,7 +27,7 @@ from ..io.datasets import labelled
 from ..linear.linearisation import sliding_rates
 from ..model.contact_coordinates import to_contact_coordinates
 from ..model.directions import direction_of
-from ..model.scene import Scene, check_corners, refuse_several_contacts, scene_in_contact_coordinates
+from ..model.scene import Scene, check_corners, scene_in_contact_coordinates
 from ..section.about_sliding import sliding_state
 from ..section.crossings import Point as SectionPoint
 from ..section.return_maps import ReturnMaps
@@ -82,11 +82,12 @@ def continue_cycle(
     - `parameter` (its value), `period` (s), `amplitude` (peak tangential speed, m/s), `stable`;
     - `sliding_stable`, whether steady sliding is stable there;
     - `multipliers` over `multiplier`, largest first, without the one for a deviation along the cycle;
-    - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there;
+    - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there, `status` and
+      `direction` (with several contacts over `contact`, too);
     - `special`: the kind of a special point, else empty: "fold", "non-smooth fold" (no multiplier is one: an impact begins to
       end the slip there, say), "period doubling", "Neimark–Sacker", "amplitude meets the sliding equilibrium", or how the
-      contact modes change there, as seen from the start outwards ("grazing of slip: stick inserted"). Special points are
-      computed to rounding;
+      contact modes change there, as seen from the start outwards ("grazing of slip: stick inserted"; with several contacts "…
+      at contact 1", or that two events change their order). Special points are computed to rounding;
     - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
       points, for the parameter itself, and where the change of modes is not a simple one.
 
@@ -104,7 +105,6 @@ def continue_cycle(
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
-    refuse_several_contacts(scene.structure, "`continue_cycle`")
     final = under_final_load(scene)
     known = [name for name, value in final.parameters.items() if np.ndim(value) == 0]
     arguments.one_of("parameter", parameter, tuple(known))
@@ -183,7 +183,7 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     if scene is not given:
         state = np.asarray(snapped_to_belt(scene, jnp.asarray(to_contact_coordinates(given.structure, state))))
     y = state - np.asarray(sliding_state(scene, scene.load.final))
-    contact = Contact(np.asarray(int(row["status"]), np.int32), np.asarray(float(row["direction"])))
+    contact = Contact(np.asarray(row["status"].values, np.int32), np.asarray(row["direction"].values, float))
     point = SectionPoint(np.asarray(y), contact)
     maps = ReturnMaps.of(scene)
     crossings = crossings_of(maps, point)
@@ -219,14 +219,16 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
         rest = sliding_state(scene, scene.load.final)
         at = None if point.real is None else on_section(scene, family.stepper, point.cycle.phases, point.real)
         states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
-        status.append(-1 if at is None else int(at.contact.status))
-        direction.append(np.nan if at is None else float(at.contact.direction))
+        none = np.shape(scene.belt_speed)
+        status.append(np.full(none, -1) if at is None else at.contact.status)
+        direction.append(np.full(none, np.nan) if at is None else at.contact.direction)
         amplitude.append(np.nan if point.real is None else float(point.real.seen.amplitude))
         if point.name == MEETS_SLIDING:
             states[-1], amplitude[-1] = rest, 0.0
     multipliers = np.stack([point.multipliers for point in points])
     largest = np.abs(multipliers[:, 0])
     names = list(family.scene.structure.coordinates)
+    each = ("point", "contact") if np.ndim(family.scene.belt_speed) else ("point",)
     dataset = xr.Dataset(
         {
             "parameter": ("point", [point.cycle.parameter for point in points]),
@@ -238,8 +240,8 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
             "word": ("point", [word_of(point.cycle.phases) for point in points]),
             "special": ("point", [point.name for point in points]),
             "state": (("point", "coordinate"), np.stack(states)),
-            "status": ("point", np.array(status, np.int8)),
-            "direction": ("point", direction),
+            "status": (each, np.array(status, np.int8)),
+            "direction": (each, np.array(direction, float)),
         },
         coords={"coordinate": [*names, *(f"d{name}" for name in names)]},
     )
@@ -250,17 +252,18 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
 
 
 def word_of(phases: Phases) -> str:
-    """The contact modes of a cycle as text; sliding faster than the belt is "slide back"."""
-    longest = int(np.argmax(phases.h))
-    usual = next((mode.direction for mode in phases.modes if mode.status == Status.SLIDE), 1.0)
-    if phases.modes[longest].status == Status.SLIDE:
-        usual = phases.modes[longest].direction
+    """The contact modes of a cycle as text; sliding faster than the belt is "slide back". Of several contacts it is
+    "slide+stick", say.
+    """
+    first = phases.modes[int(np.argmax(phases.h))]
 
-    def of(mode: Mode) -> str:
-        name = Status(mode.status).name.lower()
-        return f"{name} back" if mode.status == Status.SLIDE and mode.direction != usual else name
+    def of(mode: Mode, contact: int) -> str:
+        # Which way a contact slides in the longest phase; else in the first in which it does.
+        ways = [one.direction[contact] for one in (first, *phases.modes) if one.status[contact] == Status.SLIDE]
+        status, way = Status(mode.status[contact]), mode.direction[contact]
+        return f"{status.name.lower()} back" if status == Status.SLIDE and way != ways[0] else status.name.lower()
 
-    words = [of(mode) for mode in phases.modes]
+    words = ["+".join(of(mode, contact) for contact in range(len(mode.status))) for mode in phases.modes]
     turned = [words[k:] + words[:k] for k in range(len(words))]
     # Rotated to a unique beginning, so that the same cycle has the same word at all points.
     return " – ".join(max(turned))

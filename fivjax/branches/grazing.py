@@ -23,6 +23,11 @@ NAMES = {
 }
 
 
+def touch(mode: Mode, guard: int) -> str:
+    """What it is called that a guard touches zero."""
+    return f"{NAMES[mode.of_guard(guard)]}{f' at contact {guard // 2}' if len(mode.status) > 1 else ''}"
+
+
 class GuardMinimum(NamedTuple):
     """A minimum of a guard inside a phase; or a guard at the start of a phase, where it decides which mode follows."""
 
@@ -48,12 +53,13 @@ def guard_minima(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
     found = []
     for k, mode in enumerate(phases.modes):
         step = phases.h[k] / (looked.guards.shape[1] - 1)
-        for j in range(1 if mode.status == Status.DETACH else 2):
-            guard = looked.guards[k, :, j]
+        for j in range(looked.guards.shape[2]):
+            guard, (status, which) = looked.guards[k, :, j], mode.of_guard(j)
             size = np.max(np.abs(guard))
-            if not size > 0:
+            # Both guards of a detached contact are its gap.
+            if not size > 0 or step == 0 or (status == Status.DETACH and which == 1):
                 continue
-            if mode.status == Status.STICK or (mode.status == Status.SLIDE and j == 0):
+            if status == Status.STICK or (status == Status.SLIDE and which == 0):
                 found.append(GuardMinimum(k, j, 0.0, float(guard[0] / size), 0.0))
             inner = guard[1:-1]
             for i in np.flatnonzero((inner <= guard[:-2]) & (inner <= guard[2:])) + 1:
@@ -72,8 +78,7 @@ def images_up_to_minimum(
 ) -> tuple[PhaseImages, PhaseImages]:
     """Images of all phases, and of the phase with the minimum up to its instant."""
     family, k = curve.family, minimum.phase
-    status, pointing, _ = phases.modes[k]
-    partial = Mode(status, pointing, minimum.guard)
+    partial = phases.modes[k]._replace(ending=minimum.guard)
     modes = (*phases.modes, partial)
     following = (*phases.modes[1:], phases.modes[0], partial)
     found = images_of_phases(

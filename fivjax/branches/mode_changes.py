@@ -3,10 +3,9 @@
 import numpy as np
 from jaxtyping import Float
 
-from ..contact import Status
 from .branch_points import BranchPoint, branch_point, is_real_motion, risen_to_zero
-from .grazing import NAMES
-from .multiple_shooting import AT_SECTION, Phases
+from .grazing import touch
+from .multiple_shooting import AT_SECTION, Phases, images_of_phases
 from .pseudo_arclength import ComputedCycle, Curve, Family
 from .special_points import Special, change_between, grazing_of, name_of, root, vanishing, without
 from .verification import on_section, real_motion
@@ -36,7 +35,7 @@ def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray
         return None
     gone = [k for k in valid.phases.lasting() if ahead.phases.h[k] <= 0]
     if gone:
-        return _removed(family, curve, valid, tangent, gone[0], step)
+        return _reordered(family, curve, valid, gone[0], step) or _removed(family, curve, valid, tangent, gone[0], step)
     if turned_back := _missed(curve, here, tangent, low, high, ahead):
         return turned_back, None
     return (
@@ -60,7 +59,7 @@ def _missed(curve: Curve, here: BranchPoint, tangent, low: float, high: float, a
         _, cycle = root(lambda s: curve.along(here.cycle, tangent, s), rise, low, high)
         if cycle is not None:
             mode = curve.modes[k]
-            return Special(NAMES[Status(mode.status), mode.ending], curve, cycle, turns=True)
+            return Special(touch(mode, mode.ending), curve, cycle, turns=True)
     return None
 
 
@@ -136,6 +135,50 @@ def _removed(family: Family, curve: Curve, valid: ComputedCycle, tangent, phase:
         if onward is not None and is_real_motion(family, onward):
             return special, (branch_point(family, fewer, onward), fewer.tangent(onward, away), max(length, 1e-3))
     return special, None
+
+
+def _reordered(family: Family, curve: Curve, valid: ComputedCycle, phase: int, step: float):
+    """A change beyond which two contacts have their events in the other order, if the phase between these vanishes."""
+    modes = list(curve.modes)
+    before, own, after = modes[phase - 1], modes[phase], modes[(phase + 1) % len(modes)]
+    first, second = before.ending // 2, own.ending // 2
+    # Each event changes nothing of the other contact.
+    if first == second or before.mode_of(second) != own.mode_of(second) or own.mode_of(first) != after.mode_of(first):
+        return None
+    special = vanishing(curve, valid, phase)
+    if special is None:
+        return None
+    cycle = special.cycle
+    modes[phase - 1] = before._replace(ending=own.ending)
+    modes[phase] = before.with_mode_of(second, after)._replace(ending=before.ending)
+    ends = images_of_phases(
+        family.at(cycle.parameter),
+        family.direction,
+        family.stepper,
+        [modes[phase - 1]],
+        [modes[phase]],
+        cycle.phases.y[[phase - 1]],
+        cycle.phases.h[[phase - 1]],
+    )
+    y = cycle.phases.y.copy()
+    y[phase] = ends.y[0]
+    guess = Phases(tuple(modes), y, cycle.phases.h)
+    other = Curve(family, guess)
+    begin = other.corrected(other.unknowns(guess, cycle.parameter))
+    if begin is None:
+        return None
+    away = other.tangent(begin, None)
+    away = away * np.sign(away[len(other.of_state) + phase])
+    special = special._replace(name="the events of two contacts change their order")
+    for length in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
+        onward = other.along(begin, away, length)
+        if onward is not None and is_real_motion(family, onward):
+            return special, (
+                branch_point(family, other, onward),
+                other.tangent(onward, away),
+                max(length, min(step, 1e-3)),
+            )
+    return None
 
 
 def _shorter(family: Family, valid: ComputedCycle, phase: int):

@@ -29,9 +29,10 @@ from ..section.about_sliding import mechanics_about_sliding
 from ..section.crossings import ByMethod
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.kernel_scope import has_kernel
+from ..steppers.section import section_speed
 
-# A phase ends at one of the two guards of its mode (0 or 1), or at the section.
-AT_SECTION = 2
+# A phase ends at a guard of its mode, or at the section.
+AT_SECTION = -1
 # Instants of each phase at which its guards are evaluated.
 LOOKS = 48
 # A contact bounces ever less high until it rests. Rebounds shorter than these shares of the period are none to speak of.
@@ -39,11 +40,40 @@ SHORTEST_REBOUNDS = (1e-7, 3e-7)
 
 
 class Mode(NamedTuple):
-    """The contact mode of a phase, and the guard that ends it."""
+    """The contact mode of a phase, and the guard that ends it. Guards are those of `contact.guards`: two of the first contact,
+    then two of the second, …
+    """
 
-    status: int
-    direction: float  # of friction, if it slides; else zero
-    ending: int  # 0 or 1, a guard of the mode (`contact.guards`), or `AT_SECTION`
+    status: tuple[int, ...]  # of each contact
+    direction: tuple[float, ...]  # of friction, where a contact slides; else zero
+    ending: int  # a guard, or `AT_SECTION`
+
+    def of_guard(self, guard: int) -> tuple[Status, int]:
+        """The status of the contact that a guard belongs to, and which of its two guards it is."""
+        contact, which = divmod(guard, 2)
+        return Status(self.status[contact]), which
+
+    def mode_of(self, contact: int) -> tuple[int, float]:
+        """What one of the contacts does."""
+        return self.status[contact], self.direction[contact]
+
+    def with_mode_of(self, contact: int, other: "Mode") -> "Mode":
+        """The mode in which that contact does what it does in another one."""
+        status, direction = list(self.status), list(self.direction)
+        status[contact], direction[contact] = other.mode_of(contact)
+        return self._replace(status=tuple(status), direction=tuple(direction))
+
+    @property
+    def lands(self) -> bool:
+        """Whether a gap that closes ends the phase."""
+        return self.ending != AT_SECTION and self.of_guard(self.ending)[0] == Status.DETACH
+
+    @property
+    def contact(self) -> Contact:
+        """As the physics has it: numbers for one contact, arrays for several."""
+        direction = [one if one else 1.0 for one in self.direction]
+        places = np.s_[0] if len(direction) == 1 else np.s_[:]
+        return Contact(np.array(self.status, np.int32)[places], np.array(direction)[places])
 
 
 class Phases(NamedTuple):
@@ -65,16 +95,29 @@ class Phases(NamedTuple):
     def has_the_modes_of(self, other: "Phases") -> bool:
         """Whether both go through the same modes, but for the last rebounds of a chain, of which rounding tells the number."""
         # A rebound may be as long as one of these limits, but not as long as both.
-        return any(
-            same_modes(*(tuple(one.modes[k] for k in one.lasting(shortest)) for one in (self, other)))
-            for shortest in SHORTEST_REBOUNDS
-        )
+        return any(same_modes(*(one._modes(shortest) for one in (self, other))) for shortest in SHORTEST_REBOUNDS)
+
+    def _modes(self, shortest: float) -> tuple:
+        """The modes of what is no such short rebound, each with the guards that end it: those of two contacts, if these end at
+        once, but for rounding. Then either may be first.
+        """
+        at_once = 1e-12 * self.period
+        found: list[tuple] = []
+        for k in self.lasting(shortest):
+            (status, direction, ending), before = self.modes[k], self.modes[k - 1].ending
+            if found and abs(self.h[k]) <= at_once and before // 2 != ending // 2:
+                found[-1] = *found[-1][:2], found[-1][2] | {ending}
+            else:
+                found.append((status, direction, frozenset({ending})))
+        return tuple(found)
 
     def lasting(self, shortest: float = SHORTEST_REBOUNDS[0]) -> list[int]:
         """The phases that are no rebounds shorter than this share of the period."""
-        flies = [mode.status == Status.DETACH for mode in self.modes]
-        least = shortest * self.period
-        return [k for k, h in enumerate(self.h) if not (flies[k] and flies[k - 1] and h < least)]
+        least, modes = shortest * self.period, self.modes
+        rebounds = [
+            mode.lands and mode.ending == modes[k - 1].ending and modes[k - 1].lands for k, mode in enumerate(modes)
+        ]
+        return [k for k, h in enumerate(self.h) if not (rebounds[k] and h < least)]
 
 
 class PhaseImages(NamedTuple):
@@ -91,26 +134,24 @@ class PhaseImages(NamedTuple):
 
 
 def phases_around(segments: PeriodSegments) -> Phases | None:
-    """The phases of one period of real motion from a point of the section; None where it is at rest."""
+    """The phases of one period of real motion from a point of the section; None where it is at rest, or where the modes of two
+    contacts end at once.
+    """
     count = len(segments.h)
     modes, starts, lengths, whole = [], [], [], True
     for k in range(count):
-        status = int(segments.contact.status[k])
-        direction = float(segments.contact.direction[k]) if status == Status.SLIDE else 0.0
         if whole:
             starts.append(np.asarray(segments.y[k]))
             lengths.append(0.0)
         lengths[-1] += float(segments.h[k])
         whole = bool(np.any(segments.ended[k]))
         if whole:
-            ending = int(np.argmax(segments.ended[k])) if status != Status.DETACH else 0
-            modes.append(Mode(status, direction, ending))
+            ended = np.atleast_2d(segments.ended[k])
+            if np.sum(np.any(ended, axis=1)) > 1:
+                return None
+            modes.append(_mode_in(segments, k, int(np.argmax(ended))))
     if not modes:
-        if not count:
-            return None
-        status = int(segments.contact.status[0])
-        direction = float(segments.contact.direction[0]) if status == Status.SLIDE else 0.0
-        return Phases((Mode(status, direction, AT_SECTION),), np.stack(starts), np.array(lengths))
+        return Phases((_mode_in(segments, 0, AT_SECTION),), np.stack(starts), np.array(lengths)) if count else None
     if not whole:
         # The section cuts the first phase in two.
         starts[0], lengths[0] = starts[-1], lengths[0] + lengths[-1]
@@ -118,7 +159,13 @@ def phases_around(segments: PeriodSegments) -> Phases | None:
     return Phases(tuple(modes), np.stack(starts), np.array(lengths))
 
 
-def same_modes(a: tuple[Mode, ...], b: tuple[Mode, ...]) -> bool:
+def _mode_in(segments: PeriodSegments, k: int, ending: int) -> Mode:
+    status = np.atleast_1d(segments.contact.status[k])
+    direction = np.where(status == Status.SLIDE, np.atleast_1d(segments.contact.direction[k]), 0.0)
+    return Mode(tuple(status.tolist()), tuple(direction.tolist()), ending)
+
+
+def same_modes(a: tuple, b: tuple) -> bool:
     """Whether two sequences are the same up to rotation."""
     return len(a) == len(b) and any(a == b[k:] + b[:k] for k in range(len(b)))
 
@@ -133,7 +180,7 @@ def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) 
 def images_of_phases(scene: Scene, direction: Scene, stepper: EventExact, modes, following, y, h) -> PhaseImages:
     """`images` of single phases, each with the mode that follows it."""
     by_kernel, count = has_kernel(scene, stepper), len(modes)
-    ends = Ends(*_typed(modes), *_typed(following)[:2])
+    ends = Ends(_contacts(modes), np.array([mode.ending for mode in modes], np.int32), _contacts(following))
     own = _filled((np.asarray(y, float), np.asarray(h, float), ends), by_kernel)
     size = own[0].shape[1]
     # Directions of the derivatives: those of the state, the duration, the parameter.
@@ -153,16 +200,13 @@ def images_of_phases(scene: Scene, direction: Scene, stepper: EventExact, modes,
 class Ends(NamedTuple):
     """The contact mode of a phase, how it ends, and the mode that follows; as arrays."""
 
-    status: Int[np.ndarray, "..."]
-    pointing: Float[np.ndarray, "..."]
+    contact: Contact
     ending: Int[np.ndarray, "..."]
-    next_status: Int[np.ndarray, "..."]
-    next_pointing: Float[np.ndarray, "..."]
+    following: Contact
 
 
-def _typed(modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    status, direction, ending = np.array(modes, float).T
-    return status.astype(np.int32), direction, ending.astype(np.int32)
+def _contacts(modes) -> Contact:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *[mode.contact for mode in modes])
 
 
 def _filled(own, by_kernel: bool):
@@ -185,49 +229,50 @@ def _image_of_phase(args, numbers):
     del numbers
     mechanics = mechanics_about_sliding(scene)
     stepper = for_derivatives(how.method)
-    contact, following = Contact(ends.status, ends.pointing), Contact(ends.next_status, ends.next_pointing)
-    n, none = y.shape[0] // 2, jnp.zeros((), y.dtype)
+    contact, none = ends.contact, jnp.zeros((), y.dtype)
     begin = physics.on_constraint(mechanics, contact, y)
     end = physics.on_constraint(mechanics, contact, stepper.in_one_mode(mechanics, contact, begin, h))
-    velocity = n + mechanics.tangential
-    guards = jnp.append(physics.guards(mechanics, contact, none, end), -end[velocity])
-    ended = jnp.arange(2) == ends.ending
+    guards = physics.guards(mechanics, contact, none, end)
+    ended = (jnp.arange(guards.size) == ends.ending).reshape(guards.shape)
+    guard = jnp.sum(jnp.where(ended, guards, 0.0))
     _, after = physics.transition(mechanics, contact, none, end, ended, none)
     # What follows a landing begins on the belt: a rebound of a microsecond is far lower than what Newton's method misses.
-    after = jnp.where(ends.status == Status.DETACH, after.at[mechanics.normal].set(0.0), after)
-    after = jnp.where(
-        ends.ending == AT_SECTION, end.at[velocity].set(0.0), physics.on_constraint(mechanics, following, after)
-    )
-    return (after, jnp.sum(jnp.where(jnp.arange(3) == ends.ending, guards, 0.0))), ()
+    landed = (contact.status == Status.DETACH) & jnp.any(ended, axis=-1)
+    after = after.at[mechanics.normal].set(jnp.where(landed, 0.0, after[mechanics.normal]))
+    after = physics.on_constraint(mechanics, ends.following, after)
+    # Of several contacts, a sum of velocities is zero on the section: no one of them is.
+    velocity = y.shape[0] // 2 + mechanics.tangential
+    at_section = end if mechanics.several else end.at[velocity].set(0.0)
+    whole = ends.ending == AT_SECTION
+    return (jnp.where(whole, at_section, after), jnp.where(whole, -section_speed(mechanics, end), guard)), ()
 
 
 class Inside(NamedTuple):
     """Guards and states inside phases, at equally spaced instants of each."""
 
-    guards: Float[np.ndarray, "k look 2"]
+    guards: Float[np.ndarray, "k look guard"]
     states: Float[np.ndarray, "k look state"]
 
 
 def inside(scene: Scene, stepper: EventExact, phases: Phases) -> Inside:
     """Guards and states along all phases, including both ends of each."""
-    by_kernel, (status, direction, _) = has_kernel(scene, stepper), _typed(phases.modes)
-    own = _filled((phases.y, phases.h, status, direction), by_kernel)
+    by_kernel = has_kernel(scene, stepper)
+    own = _filled((phases.y, phases.h, _contacts(phases.modes)), by_kernel)
     _, rows = _looks((ByMethod(stepper), scene), np.linspace(0.0, 1.0, LOOKS + 1), own=own, by_kernel=by_kernel)
     return Inside(*(part[: len(phases.modes)] for part in rows))
 
 
 def _inside_of_phase(args, shares):
-    how, scene, y, h, status, direction = args
-    mechanics, contact = mechanics_about_sliding(scene), Contact(status, direction)
-    none = jnp.zeros((), y.dtype)
+    how, scene, y, h, contact = args
+    mechanics, none = mechanics_about_sliding(scene), jnp.zeros((), y.dtype)
 
     def to_next(before, share):
         y, gone = before
         y = how.method.in_one_mode(mechanics, contact, y, (share - gone) * h)
-        return (y, share), Inside(physics.guards(mechanics, contact, none, y), y)
+        return (y, share), Inside(physics.guards(mechanics, contact, none, y).reshape(-1), y)
 
     return (), jax.lax.scan(to_next, depending_on(mechanics, (y, none)), shares)[1]
 
 
-# Of (how, scene, y, h, ends), and of (how, scene, y, h, status, direction).
+# Of (how, scene, y, h, ends), and of (how, scene, y, h, contact).
 _image, _looks = KernelFunction(_image_of_phase), KernelFunction(_inside_of_phase)

@@ -14,7 +14,7 @@ from ..contact import Status
 from ..model.directions import moved_along
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
-from .multiple_shooting import Mode, PhaseImages, Phases, images
+from .multiple_shooting import AT_SECTION, Mode, PhaseImages, Phases, images
 
 
 class Family(NamedTuple):
@@ -170,12 +170,16 @@ def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
     one, after lift-off a triple one. A duration of zero would always solve their equations, so these roots are divided out.
     """
     before, own = modes[k - 1], modes[k]
-    if own.status == Status.SLIDE and own.ending == 1:
-        if before.status == Status.SLIDE and before.ending == 1:
+    if AT_SECTION in (before.ending, own.ending) or before.ending // 2 != own.ending // 2:
+        # The mode of that contact has begun earlier.
+        return 0
+    (was, ended), (status, guard) = before.of_guard(before.ending), own.of_guard(own.ending)
+    if status == Status.SLIDE and guard == 1:
+        if was == Status.SLIDE and ended == 1:
             return 1
-        return 2 if before.status == Status.STICK and len(modes) > 1 else 0
-    if own.status == Status.DETACH:
-        return 1 if before.status == Status.DETACH else 3
+        return 2 if was == Status.STICK and len(modes) > 1 else 0
+    if status == Status.DETACH:
+        return 1 if was == Status.DETACH else 3
     return 0
 
 
@@ -202,7 +206,7 @@ def _without_roots_at_start(found: PhaseImages, phases: Phases) -> PhaseImages:
     power = np.array([roots_at_start(phases.modes, k) for k in range(len(phases.modes))])
     h = phases.h / phases.period
     # Below these a guard is a rounding error; that of a rebound, which begins on the belt, has smaller ones.
-    least = np.where([mode.status == Status.DETACH for mode in phases.modes] & (power == 1), 1e-13, 1e-9)
+    least = np.where([mode.lands for mode in phases.modes] & (power == 1), 1e-13, 1e-9)
     h = np.where(np.abs(h) < least, least, h)
     share = h**-power
     return found._replace(

@@ -89,11 +89,13 @@ def _rebounds_change(special: Special) -> bool:
     if special.turns:
         return False
     if special.multiplier is not None:
-        return any(a.status == Status.DETACH != b.status for a, b in zip(modes, modes[1:] + modes[:1], strict=True))
+        pairs = zip(modes, modes[1:] + modes[:1], strict=True)
+        return any(a.lands and b.of_guard(a.ending)[0] != Status.DETACH for a, b in pairs)
     if special.grazing is None:
         return False
     minimum = special.grazing.minimum
-    return minimum.time == 0 and modes[minimum.phase - 1].status == Status.DETACH
+    before = modes[minimum.phase - 1]
+    return minimum.time == 0 and before.lands and before.ending // 2 == minimum.guard // 2
 
 
 def _of_stability_limit(family: Family, limit: float, name: str) -> float:

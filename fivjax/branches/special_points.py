@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..contact import Status
-from .grazing import NAMES, Grazing, grazing_near, guard_minima
+from .grazing import Grazing, grazing_near, guard_minima, touch
 from .multiple_shooting import AT_SECTION, Mode, Phases, same_modes
 from .pseudo_arclength import ComputedCycle, Curve, multipliers_of
 
@@ -146,24 +146,29 @@ def change_between(longer: Sequence[Mode], shorter: Sequence[Mode]) -> Change | 
     if len(shorter) == 1 and shorter[0].ending == AT_SECTION:
         # Without any event the section takes the place of one.
         extra = [i for i in range(count) if not alike(longer[i], shorter[0])]
-        return Change(extra[0], True, _inserted(longer[extra[0]])) if count == 2 and len(extra) == 1 else None
+        return (
+            Change(extra[0], True, _inserted(longer[extra[0]], shorter[0])) if count == 2 and len(extra) == 1 else None
+        )
     for i in range(count):
         before, after = longer[i - 1], longer[(i + 1) % count]
         if count - len(shorter) == 2 and alike(before, after) and count > 2:
             kept = [mode for j, mode in enumerate(longer) if j not in (i, (i - 1) % count)]
             if same_modes(tuple(kept), shorter):
-                return Change(i, True, _inserted(longer[i]))
+                return Change(i, True, _inserted(longer[i], after))
         if count - len(shorter) == 1:
             kept = longer[:i] + longer[i + 1 :]
             if same_modes(kept, shorter):
                 split = alike(longer[i], after) and longer[i].ending != after.ending
-                split = split or (alike(longer[i], after) and longer[i].status == Status.DETACH)
-                return Change(i, split, "impact" if split else _inserted(longer[i]))
+                split = split or (alike(longer[i], after) and longer[i].lands)
+                return Change(i, split, "impact" if split else _inserted(longer[i], after))
     return None
 
 
-def _inserted(mode: Mode) -> str:
-    return {Status.STICK: "stick", Status.SLIDE: "slip", Status.DETACH: "lift-off"}[Status(mode.status)]
+def _inserted(mode: Mode, after: Mode) -> str:
+    """What the contact does in a mode that does something else after it."""
+    changed = [mode.mode_of(contact) != after.mode_of(contact) for contact in range(len(mode.status))]
+    status = mode.status[changed.index(True) if any(changed) else 0]
+    return {Status.STICK: "stick", Status.SLIDE: "slip", Status.DETACH: "lift-off"}[Status(status)]
 
 
 def grazing_of(curve: Curve, guess: ComputedCycle, lowest: int = 4) -> Grazing | None:
@@ -190,7 +195,7 @@ def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> st
     if grazing is None:
         return what or "contact modes change"
     mode = grazing.cycle.phases.modes[grazing.minimum.phase]
-    how = NAMES[Status(mode.status), grazing.minimum.guard]
+    how = touch(mode, grazing.minimum.guard)
     return f"{how}: {what}" if what else how
 
 

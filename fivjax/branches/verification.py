@@ -4,15 +4,14 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from ..contact import Contact, Status
+from ..contact import Status
 from ..cycles.one_period import PeriodSummary, follow_period
 from ..model.scene import Scene
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 from ..steppers.event_exact import EventExact
-from .multiple_shooting import AT_SECTION, LOOKS, Mode, Phases, inside, phases_around
+from .multiple_shooting import AT_SECTION, LOOKS, Phases, inside, phases_around
 
 # A motion on the cycle returns to its start within this share of its size.
 BACK = 1e-6
@@ -32,10 +31,10 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> RealMotion
     if not (np.all(np.isfinite(phases.y)) and np.all(phases.h > -1e-9 * phases.period)):
         return None
     # Started in the middle of a phase, far from events, so that none is met twice or missed.
-    longest = int(np.argmax(np.where([mode.status == Status.STICK for mode in phases.modes], 0.0, phases.h)))
+    longest = int(np.argmax(np.where([Status.STICK in mode.status for mode in phases.modes], 0.0, phases.h)))
     whole = phases.modes[longest].ending == AT_SECTION
     start = (
-        _point(phases.modes[longest], phases.y[longest])
+        Point(phases.y[longest], phases.modes[longest].contact)
         if whole
         else _states(scene, stepper, phases, [LOOKS // 2])[longest]
     )
@@ -45,7 +44,7 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> RealMotion
 
 def on_section(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotion) -> Point | None:
     """The first crossing of the section on a computed cycle; None if there is none."""
-    if float(real.start.y[scene.structure.size + scene.structure.tangential]) == 0.0:
+    if phases.modes[0].ending == AT_SECTION:
         return real.start
     # On a cycle that grazes, rounding tells what follows the touch: from elsewhere the section may come before it.
     maps = ReturnMaps.of(scene)
@@ -62,12 +61,7 @@ def _reached(maps: ReturnMaps, starts: list[Point]) -> Point | None:
 def _states(scene: Scene, stepper: EventExact, phases: Phases, looks: Iterable[int]) -> list[Point]:
     """The states at these instants, of `LOOKS`, of all phases."""
     states = inside(scene, stepper, phases).states
-    return [_point(mode, y) for look in looks for mode, y in zip(phases.modes, states[:, look], strict=True)]
-
-
-def _point(mode: Mode, y: Float[np.ndarray, " state"]) -> Point:
-    direction = mode.direction if mode.direction else 1.0
-    return Point(np.asarray(y), Contact(np.asarray(mode.status, np.int32), np.asarray(direction, np.float64)))
+    return [Point(y, mode.contact) for look in looks for mode, y in zip(phases.modes, states[:, look], strict=True)]
 
 
 def crossings_of(maps: ReturnMaps, point: Point) -> int | None:

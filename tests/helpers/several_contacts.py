@@ -21,6 +21,16 @@ def copies(count, structure=None, shares=None):
     )
 
 
+def coupled(count: int) -> fj.Structure:
+    """Copies of the paper's oscillator under different shares of the load, neighbours held together firmly along the belt."""
+    structure = copies(count, shares=1 + 0.1 * np.arange(count))
+    mass, damping, stiffness, load = (np.array(matrix) for matrix in structure.matrices)
+    for k in range(count - 1):
+        for matrix, value in ((stiffness, 1e6), (damping, 200.0)):
+            matrix[np.ix_([3 * k, 3 * k + 3], [3 * k, 3 * k + 3])] += value * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    return fj.Structure(mass, damping, stiffness, load, contacts=structure.contacts)
+
+
 def scene_of(structure, *, mu=0.2, mu_static=None, belt=3.0, force=100.0, p=1.0, restitution=0.0):
     count = len(structure.contacts)
     mu, mu_static, belt = (

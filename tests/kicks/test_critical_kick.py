@@ -6,7 +6,7 @@ import pytest
 import fivjax as fj
 from fivjax.kicks.stable_manifold import critical_kick
 from tests.helpers import reference
-from tests.helpers.several_contacts import copies, scene_of
+from tests.helpers.several_contacts import coupled, scene_of
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 
@@ -83,12 +83,7 @@ def test_derivatives_are_refused_with_steps_that_are_not_exact():
 @pytest.mark.slow
 def test_derivatives_of_several_contacts_are_differences_of_kicks():
     """Two oscillators that a spring couples, under different loads: forces and belt speeds scale, and kicks of other scenes."""
-    structure = copies(2, shares=[1.0, 1.1])
-    mass, damping, stiffness, load = map(np.array, structure.matrices)
-    stiffness[np.ix_([0, 3], [0, 3])] += 1e6 * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    damping[np.ix_([0, 3], [0, 3])] += 200.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    structure = fj.Structure(mass, damping, stiffness, load, contacts=structure.contacts)
-    scene = scene_of(structure, belt=1.0, p=1.3)
+    scene = scene_of(coupled(2), belt=1.0, p=1.3)
     found = fj.critical_perturbation(
         scene, force=[100.0], p_range=(1.42, 1.45), p_step=0.01, derivatives=True, progress=False
     ).isel(force=0)

@@ -1,0 +1,141 @@
+"""Branches of cycles of several contacts: as those of one of them alone, and against a solver that shares no code."""
+
+import numpy as np
+import pytest
+
+import fivjax as fj
+from fivjax.branches.multiple_shooting import AT_SECTION, Mode, Phases
+from fivjax.branches.pseudo_arclength import roots_at_start
+from fivjax.branches.special_points import change_between
+from fivjax.contact import Status
+from tests.helpers import several_contacts_reference as reference
+from tests.helpers.several_contacts import copies, coupled
+
+STICK, SLIDE, DETACH = Status.STICK, Status.SLIDE, Status.DETACH
+
+
+def mode(first: Status, second: Status, ending: int) -> Mode:
+    return Mode((int(first), int(second)), (float(first == SLIDE), float(second == SLIDE)), ending)
+
+
+def test_events_of_two_contacts_at_once_may_come_in_either_order():
+    """To rounding they are at once; else the order is one of the modes."""
+
+    def sequence(first: int, between: float) -> Phases:
+        other = mode(STICK, SLIDE, 3) if first == 1 else mode(SLIDE, STICK, 1)
+        modes = mode(SLIDE, SLIDE, first), other, mode(STICK, STICK, 0), mode(SLIDE, STICK, 2)
+        return Phases(modes, np.zeros((4, 12)), np.array([1.0, between, 0.1, 0.2]))
+
+    assert sequence(1, 0.0).has_the_modes_of(sequence(3, -1e-15))
+    assert not sequence(1, 1e-6).has_the_modes_of(sequence(3, 1e-6))
+    assert sequence(1, 1e-6).has_the_modes_of(sequence(1, 1e-6))
+
+
+def test_a_guard_has_roots_at_the_start_of_a_phase_only_if_its_contact_begins_something_there():
+    modes = (
+        mode(DETACH, SLIDE, 0),
+        mode(DETACH, SLIDE, 0),
+        mode(SLIDE, SLIDE, 3),
+        mode(SLIDE, STICK, 2),
+        mode(SLIDE, SLIDE, 0),
+    )
+    # An impact after a lift-off, one after an impact; nothing of the second contact has begun where the first lands.
+    assert [roots_at_start(modes, k) for k in range(5)] == [3, 1, 0, 0, 0]
+    # Slip after sticking.
+    assert roots_at_start((mode(SLIDE, STICK, 2), mode(SLIDE, SLIDE, 3)), 1) == 2
+    assert roots_at_start((mode(SLIDE, SLIDE, AT_SECTION),), 0) == 0
+
+
+def test_a_change_is_called_by_what_its_own_contact_does():
+    shorter = mode(SLIDE, SLIDE, 0), mode(DETACH, SLIDE, 0)
+    longer = mode(SLIDE, SLIDE, 3), mode(SLIDE, STICK, 2), *shorter
+    found = change_between(longer, shorter)
+    assert found is not None and found.word == "stick" and found.merges and found.phase == 1
+
+
+@pytest.mark.slow
+def test_the_branch_of_a_contact_beside_one_that_slides_is_that_of_it_alone():
+    """Two oscillators without coupling: special points, their derivatives, periods and peaks are those of one."""
+    one = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 0.5, fj.ConstantLoad(100.0))
+    pair = fj.Scene(copies(2, shares=[0.5, 1.0]), fj.Coulomb(0.2), np.full(2, 0.5), fj.ConstantLoad(100.0))
+    cycle = fj.limit_cycle(one)
+    rest = 0.5 * np.asarray(fj.simulate(one, 1e-3).displacement[0])
+    displacement, velocity = np.split(np.asarray(cycle.state), 2)
+    start = np.concatenate([rest, displacement, np.zeros(3), velocity])
+    alone = fj.continue_cycle(one, "mu", (0.16, 0.21), cycle, derivatives=True)
+    beside = fj.continue_cycle(pair, "mu", (0.16, 0.21), start, derivatives=True)
+    assert beside.attrs["ends"] == alone.attrs["ends"] and beside.sizes["contact"] == 2
+    special = [branch.isel(point=np.flatnonzero(branch["special"] != "")) for branch in (alone, beside)]
+    assert [name.replace(" at contact 1", "") for name in special[1]["special"].values] == list(
+        special[0]["special"].values
+    )
+    for name in ("parameter", "period", "amplitude"):
+        np.testing.assert_allclose(special[1][name], special[0][name], rtol=1e-10)
+    np.testing.assert_allclose(
+        special[1]["d_special"].sel(of="force"), special[0]["d_special"].sel(of="force"), rtol=1e-8
+    )
+    # The multipliers of the cycle alone are among those of the pair.
+    for k in range(special[0].sizes["point"]):
+        apart = np.abs(special[1]["multipliers"].values[k][:, None] - special[0]["multipliers"].values[k])
+        assert np.max(np.min(apart, axis=0)) < 1e-6
+
+
+@pytest.fixture(scope="module")
+def branch():
+    """Two oscillators held together along the belt, under different loads; where their events change the order."""
+    scene = fj.Scene(coupled(2), fj.Coulomb(0.2), np.ones(2), fj.ConstantLoad(100.0))
+    return fj.continue_cycle(scene, "force", (50.0, 100.0))
+
+
+@pytest.mark.slow
+def test_branches_of_coupled_contacts_are_cycles_of_an_independent_solver(branch):
+    scene = fj.Scene.from_dataset(branch)
+    for k in np.linspace(0, branch.sizes["point"] - 1, 12).astype(int):
+        row = branch.isel(point=int(k))
+        if str(row["special"].values):
+            continue
+        here = scene.replace(force=float(row["parameter"]))
+        mass, damping, stiffness, load = map(np.asarray, here.structure.matrices)
+        along, away = np.eye(6)[:, [0, 3]], np.eye(6)[:, [2, 5]]
+        model = reference.Model(
+            mass,
+            damping,
+            stiffness,
+            load * float(here.load.final),
+            along,
+            away,
+            np.full(2, 0.2),
+            np.ones(2),
+            np.zeros(2),
+        )
+        end, _ = reference.events(model, row["state"].values, float(row["period"]))
+        weights = np.asarray(here.structure.weights)
+        apart = np.linalg.norm(weights * (end - row["state"].values)) / np.linalg.norm(weights * row["state"].values)
+        # An unstable direction grows by a quarter a period.
+        assert apart < 1e-9
+
+
+@pytest.mark.slow
+def test_events_of_two_contacts_change_their_order_along_a_branch(branch):
+    """At once there, and in one order before and in the other one after it."""
+    names = branch["special"].values
+    places = np.flatnonzero(names == "the events of two contacts change their order")
+    assert len(places) == 3
+    for k in places:
+        before, after = branch["word"].values[k - 1], branch["word"].values[k + 1]
+        assert before != after and len(before.split(" – ")) == len(after.split(" – "))
+        # The parameter goes on over it, with period and peak.
+        for name in ("parameter", "period"):
+            near = branch[name].values[k - 1 : k + 2]
+            assert min(near[0], near[2]) < near[1] < max(near[0], near[2])
+
+
+@pytest.mark.slow
+def test_points_of_branches_are_cycles_with_the_multipliers_of_their_own_motion(branch):
+    for k in (0, branch.sizes["point"] - 1):
+        cycle, row = fj.cycle_at(branch, k), branch.isel(point=k)
+        assert cycle.period == pytest.approx(float(row["period"]), rel=1e-12)
+        own = np.sort(np.abs(cycle.multipliers))[::-1]
+        np.testing.assert_allclose(
+            np.delete(own, np.argmin(np.abs(own - 1)))[:4], np.abs(row["multipliers"][:4]), rtol=1e-8
+        )
