@@ -157,7 +157,8 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     **Returns:** a `LimitCycle`. Where contact modes change, the return map has no derivative, and the multipliers are those of
     the branch, on one side of that point.
 
-    **Raises:** `TypeError` or `ValueError` for an object that is no branch, or an `i` that is not among its points;
+    **Raises:** `TypeError` or `ValueError` for an object that is no branch, an `i` that is not among its points, and a
+    structure by a function of your own that has made none in this process;
     `NoLimitCycle` if the motion does not come back to the section: at nearly zero amplitude, and at some grazings, where
     rounding tells what it does.
 
@@ -177,7 +178,13 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
             f"Argument `branch` must come from `fivjax.continue_cycle`, and `i` be the place of one of its points, "
             f"but is {i!r}."
         ) from None
-    given = Scene.from_dataset(branch).replace(**{name: value})
+    given = Scene.from_dataset(branch)
+    if name not in given.parameters:
+        raise ValueError(
+            f"The branch is over `{name}`, a parameter of a structure by a function of your own, which its dataset does not "
+            f"hold. Make a structure by that function first."
+        )
+    given = given.replace(**{name: value})
     scene = scene_in_contact_coordinates(given)
     state = np.asarray(row["state"])
     if scene is not given:

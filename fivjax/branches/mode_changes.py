@@ -41,7 +41,7 @@ def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray
     return (
         _inserted(family, curve, valid, ahead, tangent, step)
         or _removed(family, curve, valid, tangent, min(valid.phases.lasting(), key=lambda k: valid.phases.h[k]), step)
-        or _grazes(curve, ahead, step)
+        or _grazes(curve, valid, ahead)
     )
 
 
@@ -63,10 +63,10 @@ def _missed(curve: Curve, here: BranchPoint, tangent, low: float, high: float, a
     return None
 
 
-def _grazes(curve: Curve, ahead: ComputedCycle, step: float):
+def _grazes(curve: Curve, valid: ComputedCycle, ahead: ComputedCycle):
     """A change beyond which no cycle is found, though it is known which guard touches zero."""
     grazing = grazing_of(curve, ahead)
-    if grazing is None or not _near(curve, grazing.cycle, ahead, step):
+    if grazing is None or not _between(grazing.cycle, valid, ahead):
         return None
     return Special(name_of(grazing, None, removed=False), curve, grazing.cycle, grazing.row, grazing), None
 
@@ -88,7 +88,7 @@ def _inserted(family: Family, curve: Curve, valid: ComputedCycle, ahead: Compute
         if first is None or not is_real_motion(family, first):
             continue
         special, grazing = None, grazing_of(curve, ahead)
-        if grazing is not None and _near(curve, grazing.cycle, ahead, step):
+        if grazing is not None and _between(grazing.cycle, valid, ahead):
             name = name_of(grazing, change, removed=False)
             special = Special(name, curve, grazing.cycle, grazing.row, grazing)
         elif change is not None and not change.merges:
@@ -120,7 +120,7 @@ def _removed(family: Family, curve: Curve, valid: ComputedCycle, tangent, phase:
         return None
     special, away = None, fewer.tangent(first, None)
     grazing = grazing_of(fewer, first)
-    if grazing is not None and _near(fewer, grazing.cycle, first, 1e-3):
+    if grazing is not None and _apart(grazing.cycle, first) < 2e-3:
         special = Special(name_of(grazing, change, removed=True), fewer, grazing.cycle, grazing.row, grazing)
         away = fewer.tangent(grazing.cycle, None)
         away = away * np.sign(grazing.row @ away)
@@ -227,8 +227,13 @@ def with_own_rebounds(
     return branch_point(family, curve, cycle), onward * (1.0 if before @ after >= 0 else -1.0)
 
 
-def _near(curve: Curve, found: ComputedCycle, guess: ComputedCycle, step: float) -> bool:
-    return float(np.linalg.norm(found.u - guess.u)) < max(2 * step, 1e-3)
+def _between(found: ComputedCycle, valid: ComputedCycle, ahead: ComputedCycle) -> bool:
+    """Whether a cycle is where the modes change: another guard may graze not far away. Very short rebounds count late."""
+    return _apart(found, ahead) < max(2 * _apart(valid, ahead), 1e-4)
+
+
+def _apart(one: ComputedCycle, other: ComputedCycle) -> float:
+    return float(np.linalg.norm(one.u - other.u))
 
 
 def _outward(family: Family, curve: Curve, first: ComputedCycle, tangent, special: ComputedCycle | None):

@@ -13,6 +13,7 @@ from jaxtyping import Complex, Float
 from ..contact import Status
 from ..model.directions import moved_along
 from ..model.scene import Scene
+from ..section.return_maps import weights_of
 from ..steppers.event_exact import EventExact
 from .multiple_shooting import AT_SECTION, Mode, PhaseImages, Phases, images
 
@@ -49,7 +50,7 @@ class Curve:
     def __init__(self, family: Family, phases: Phases):
         """`phases`: a cycle of these modes, or a guess of one; its size and period are the units of the unknowns."""
         self.family, self.modes = family, phases.modes
-        self.weights = np.asarray(family.scene.structure.weights)
+        self.weights = weights_of(family.scene.structure)
         self.size = phases.size(self.weights)
         self.time = phases.period
         self.of_state = np.tile(self.size / self.weights, len(self.modes))

@@ -57,7 +57,7 @@ def calibrate(
     - `data`: a `Recording`, or several, each with the parameters known for its run.
     - `free`: names of parameters, any of `scene.parameters` that is a single number. Friction laws in a list have a name for
       each contact: `mu_0`, `mu_1`, …
-    - `bounds`: pairs by name. Unless given, a parameter is kept positive (`theta` and `belt_speed` may have any value).
+    - `bounds`: pairs by name. Unless given, a positive parameter is kept so (`theta` and `belt_speed` may have any value).
     - `starts`: the number of first guesses: the scene's own, and others within `spread` (relative) around it, drawn with
       `seed`. For limit cycles there are at least 32, with sliding modes at the measured frequency.
     - `rate`: recordings are averaged over so many blocks per second before they are compared; unless given, 16 per period of

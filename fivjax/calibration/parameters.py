@@ -11,7 +11,7 @@ from ..foundation import arguments
 from ..foundation.digits import apart
 from ..model.scene import Scene
 
-# Parameters that may be negative; all others are positive.
+# Parameters that may be negative; all others are positive, unless bounds say otherwise for one that the scene takes.
 SIGNED = ("theta", "belt_speed")
 HIGHEST = {"restitution": 1.0}
 
@@ -52,7 +52,7 @@ class FreeParameters(eqx.Module):
         for name in names:
             refuse_one_for_each_contact(scene, name, "free")
             value = float(known[name])
-            low, high = _bound(name, bounds.get(name))
+            low, high = _bound(scene, name, bounds.get(name))
             if not low < value < high:
                 least, most, own = apart(low, high, value)
                 raise ValueError(
@@ -112,15 +112,24 @@ def refuse_one_for_each_contact(scene: Scene, name: str, what: str) -> None:
         )
 
 
-def _bound(name: str, bound) -> tuple[float, float]:
-    lowest = -np.inf if name in SIGNED else 0.0
-    highest = HIGHEST.get(name, np.inf)
+def _bound(scene: Scene, name: str, bound) -> tuple[float, float]:
+    value, highest = float(scene.parameters[name]), HIGHEST.get(name, np.inf)
     if bound is None:
-        return lowest, highest
+        return -np.inf if name in SIGNED or value < 0 else 0.0, highest
     array = arguments.numeric_array(f"bounds[{name!r}]", bound).astype(np.float64)
     if array.shape != (2,) or np.any(np.isnan(array)) or not array[0] < array[1]:
         raise ValueError(f"Argument `bounds[{name!r}]` must be a pair that goes up, but is {bound!r}.")
+    least = float(array[0]) if np.isfinite(array[0]) else -abs(value) - 1.0
+    lowest = -np.inf if least >= 0 or _takes(scene, name, least) else 0.0
     low, high = max(float(array[0]), lowest), min(float(array[1]), highest)
     if np.isfinite(high) and not np.isfinite(low):
         raise ValueError(f"Argument `bounds[{name!r}]` must also have a finite lower end, but is {bound!r}.")
     return low, high
+
+
+def _takes(scene: Scene, name: str, value: float) -> bool:
+    try:
+        scene.replace(**{name: value})
+    except ValueError:
+        return False
+    return True

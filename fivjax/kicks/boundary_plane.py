@@ -21,6 +21,7 @@ from ..model.directions import directions_of
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
+from ..section.return_maps import weights_of
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
 from .critical import critical_perturbation
@@ -78,7 +79,7 @@ def boundary_section(
     found = critical_perturbation(scene, p_range=p_range, progress=False).isel(belt_speed=0)
     bracket = float(found["p_crit_low"]), float(found["p_crit_high"])
     critical = critical_kick(scene, bracket, ()) if np.all(np.isfinite(bracket)) else None
-    weights = np.asarray(scene.structure.weights)
+    weights = weights_of(scene.structure)
     saddle = None if critical is None else saddle_of(critical.saddle, weights)
     if critical is None or saddle is None:
         raise ValueError(

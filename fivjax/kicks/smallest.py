@@ -25,6 +25,7 @@ from ..foundation.progress import reported
 from ..maps.groups import OF_KICK
 from ..model.load import Pulse
 from ..model.scene import Scene
+from ..section.return_maps import weights_of
 from ..verdicts.sliding_proof import envelope_peak
 from .critical import critical_perturbation
 from .perturbations import stable_sliding
@@ -214,7 +215,7 @@ def _descended(scene: Scene, p: float, duration: float, shortest: float, longest
         nonlocal saddle
         found = critical_kick(scene.replace(duration=d), (near * (1 - 1e-4), near * (1 + 1e-4)), ("duration",), saddle)
         if found is not None and saddle is None:
-            saddle = saddle_of(found.saddle, np.asarray(scene.structure.weights))
+            saddle = saddle_of(found.saddle, weights_of(scene.structure))
         return found
 
     here = critical(duration, p)

@@ -23,7 +23,7 @@ from ..foundation.precision import in_double_precision
 from ..model.directions import directions_of
 from ..model.scene import Scene
 from ..section.crossings import Point
-from ..section.return_maps import ReturnMaps
+from ..section.return_maps import ReturnMaps, weights_of
 from ..steppers.event_exact import EventExact
 from .response import MOST_CROSSINGS, Crossings, kicked, returned, started
 
@@ -126,7 +126,7 @@ def critical_kick(
     **Arguments:** `scene`, whose load is a `Pulse`; `bracket`, values of p on either side; `names` of the parameters;
     `saddle`, if it is known.
     """
-    stepper, weights = EventExact(), np.asarray(scene.structure.weights)
+    stepper, weights = EventExact(), weights_of(scene.structure)
     low, high = bracket
     # With all derivatives in each trajectory: one kernel for these, too, takes longer to build than they take.
     directions = directions_of(scene, ("p", *names))
@@ -166,7 +166,7 @@ def _derivatives(
     path: Crossings,
     near: ManifoldDistances,
 ) -> dict[str, float]:
-    weights = np.asarray(scene.structure.weights)
+    weights = weights_of(scene.structure)
     with np.errstate(all="ignore"):
         error = near.distance / np.abs(near.slope)
     place = int(near.place[np.nanargmin(error)])
@@ -184,7 +184,7 @@ def manifold_normal(
 
     **Arguments:** `scene`; `y`, a deviation from the sliding equilibrium under the final load; `saddle`, if it is known.
     """
-    stepper, weights = EventExact(), np.asarray(scene.structure.weights)
+    stepper, weights = EventExact(), weights_of(scene.structure)
     start = ReturnMaps.of(scene).in_contact(np.zeros(1, int), np.asarray(y)[None]).point(0)
     path = started(scene, stepper, start, np.eye(len(y)), MOST_CROSSINGS)
     saddle = saddle_passed(scene, path) if saddle is None else saddle

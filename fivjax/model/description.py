@@ -3,6 +3,7 @@
 A dataset's attributes hold everything that defines its scene, so that `Scene.from_dataset` needs no other file.
 """
 
+import contextlib
 import dataclasses
 import html
 import json
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..foundation.precision import in_double_precision
 from ..foundation.quantities import QUANTITIES
 from ..foundation.traced_code import digest
 from .belt import belt_oscillator
@@ -19,6 +21,7 @@ from .contact_point import ContactPoint
 from .friction import AbstractFriction
 from .friction_per_contact import FrictionPerContact
 from .load import AbstractLoad
+from .own_structures import remembered
 from .structure import Structure
 
 # Functions that make a structure from named parameters.
@@ -37,6 +40,7 @@ def describe(scene) -> dict:
         "parameters": {name: np.asarray(value).tolist() for name, value in scene.parameters.items()},
         "of_friction": list(scene.parameters_of("friction law")),
         "of_load": list(scene.parameters_of("load")),
+        **_own_code(structure),
         **{name: np.asarray(getattr(structure, name)).tolist() for name in MATRICES},
         **_places(structure),
         "coordinates": list(structure.coordinates),
@@ -52,8 +56,21 @@ def code_of(scene) -> dict[str, str]:
     return {
         "friction law": " ".join(digest(_of_law, law, one) for law in laws),
         "load": digest(_of_load, scene.load, one),
-        "structure": digest(_of_structure, scene.structure, scene.structure.parameters),
+        "structure": code_of_structure(scene.structure),
     }
+
+
+def _own_code(structure: Structure) -> dict:
+    """Of a structure by a function of one's own: the names of its parameters, and a digest of what that function computes."""
+    if not structure.parameters or structure.builder in BUILDERS.values():
+        return {}
+    return {"of_structure": list(structure.parameters), "structure_code": code_of_structure(structure)}
+
+
+@in_double_precision
+def code_of_structure(structure: Structure) -> str:
+    """A digest of what the function computes that made a structure from its parameters."""
+    return digest(_of_structure, structure, structure.parameters)
 
 
 def _of_law(law: AbstractFriction, speed):
@@ -113,8 +130,8 @@ def description_in(dataset) -> dict:
 def arguments_of_scene(description: Mapping) -> dict:
     """The arguments of `Scene` that a description stands for.
 
-    A structure made by a function that fivjax does not know comes back as its matrices: the same motion, without the
-    names of its parameters.
+    A structure made by a function of one's own comes back with its parameters where this process has made one by the same
+    function; else as its matrices: the same motion, without the names of its parameters.
 
     **Raises:** `ValueError` for a friction law or a load whose class is not defined, or whose constructor does not take the
     numbers that were saved; errors of other kinds for a damaged description.
@@ -143,6 +160,19 @@ def _structure(description: Mapping) -> Structure:
             built = builder(**{name: description["parameters"][name] for name in names})
             if _is_described(built, description):
                 return built
+    if "structure_code" in description:
+        parameters = {name: description["parameters"][name] for name in description["of_structure"]}
+        for maker in remembered():
+            with contextlib.suppress(
+                Exception
+            ):  # of any kind: the code is somebody else's, and may take other parameters
+                built = maker(**parameters)
+                same = (
+                    set(built.parameters) == set(parameters)
+                    and code_of_structure(built) == description["structure_code"]
+                )
+                if same and _is_described(built, description):
+                    return built
     places = {name: description[name] for name in ("tangential", "normal", "coordinates") if name in description}
     if "contacts" in description:
         places["contacts"] = [ContactPoint(pair["tangential"], pair["normal"]) for pair in description["contacts"]]

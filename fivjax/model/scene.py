@@ -175,7 +175,7 @@ class Scene(eqx.Module):
             scene = fj.Scene.from_dataset(fj.open("map.nc"))
 
         Friction laws and loads of your own must be defined or imported first. A structure that a function of your own made
-        comes back as its matrices.
+        comes back with its parameters where that function has made one in this process before; else as its matrices.
 
         **Raises:** `ValueError` for a dataset without a scene in its attributes, with a damaged one, or with parts of unknown
         classes.

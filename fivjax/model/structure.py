@@ -22,6 +22,7 @@ from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision, is_known, real, state_for_pickle, state_from_pickle
 from .contact_point import ContactPoint, directions, resolve_contacts
 from .matrix_checks import check_matrix, check_names, check_shapes
+from .own_structures import remember
 from .printing import as_call
 
 
@@ -218,6 +219,10 @@ class Structure(eqx.Module):
         if not parameters:
             raise ValueError("Argument `parameters` must hold at least one. Give matrices without any to `Structure`.")
         for name, value in parameters.items():
+            if name in ("self", "scene"):
+                raise ValueError(
+                    f"Argument `parameters` must not name one `{name}`, which functions of fivjax take first."
+                )
             arguments.real_number(name, value)
         numbers = {name: real(value) for name, value in parameters.items()}
         dampers = arguments.listed_names("dampers", dampers, "c1")
@@ -235,6 +240,11 @@ class Structure(eqx.Module):
                 "over them demand. NumPy, `math` and `if` need the numbers; `jnp.array`, `jnp.sqrt` and `jnp.where` do not."
             ) from error
         checked = cls(*matrices, tangential, normal, contacts=contacts, coordinates=coordinates)
+        settings = {"contacts": checked.contacts, "coordinates": checked.coordinates, "dampers": dampers}
+        remember(
+            matrices_of if builder is None else builder,
+            builder or (lambda **values: cls.from_parameters(matrices_of, values, **settings)),
+        )
         return eqx.tree_at(lambda s: s.source, checked, source)
 
     @property

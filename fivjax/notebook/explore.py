@@ -169,11 +169,9 @@ class Explorer:
         self.update()
 
     def _judge(self, scene: Scene, lines: list[str]) -> None:
-        # The time for which the trajectory shown is followed for its verdict, s.
-        t_max = 10.0
         name = next(iter(self.sliders))
         try:
-            found = bistability_map(scene, t_max=t_max, progress=False, **{name: [float(scene.parameters[name])]})
+            found = bistability_map(scene, progress=False, **{name: [float(scene.parameters[name])]})
             first = _in_words((Verdict(int(found["verdict"][0])), float(found["decided_at"][0])))
         except ValueError as error:
             first = f"<i>{error}</i>"

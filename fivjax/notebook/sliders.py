@@ -39,7 +39,8 @@ def slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     """A slider for one parameter; its range includes the scene's value and both ends of the map's axis of that name."""
     # The range of a structure's parameters, relative to their values.
     shares = (0.5, 1.5)
-    low, high = ranges.get(name) or RANGES.get(_kind(name)) or tuple(share * value for share in shares)
+    usual = RANGES.get(_kind(name)) or tuple(share * abs(value) for share in shares)
+    low, high = ranges.get(name) or (usual if value >= 0 else (-usual[1], -usual[0]))
     reached = [value, *([axes[name][0], axes[name][-1]] if name in axes else [])]
     low, high = float(min(low, *reached)), float(max(high, *reached))
     if low == high:

@@ -98,6 +98,12 @@ class Images(NamedTuple):
     peak: Float[np.ndarray, " m"]  # the largest tangential speed on the way, m/s; 0 unless asked for
 
 
+def weights_of(structure: Structure) -> Float[np.ndarray, " state"]:
+    """`Structure.weights`, all of them positive: a coordinate that no spring holds has no weight of its own."""
+    weights = np.asarray(structure.weights)
+    return np.where(weights > 0, weights, np.min(weights[weights > 0]))
+
+
 class ReturnMaps:
     """The return maps of all groups.
 
@@ -118,9 +124,7 @@ class ReturnMaps:
         self.kernels, self.pool, self.known_to = kernels, pool, known_to
         self.shared = mechanics, longest
         self.structure = structure
-        weights = np.asarray(structure.weights)
-        # A coordinate that no spring holds has no weight of its own.
-        self.weights = np.where(weights > 0, weights, np.min(weights[weights > 0]))
+        self.weights = weights_of(structure)
         # The direction of friction if the contact slides on the section, where the belt is faster.
         self.sliding = np.sign(np.asarray(mechanics.belt_speed))
         self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL

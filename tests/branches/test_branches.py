@@ -1,11 +1,13 @@
 """Branches of limit cycles against closed forms, against ODE solvers of another kind, and against trajectories."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fivjax as fj
 from fivjax.branches import pseudo_arclength
 from fivjax.branches.special_points import pairing
+from fivjax.model import own_structures
 from tests.helpers import oracle, reference
 from tests.helpers.catalogue import full_matrices
 from tests.helpers.reference import cycles
@@ -81,6 +83,24 @@ def test_cycle_at_gives_the_cycle_back(branch):
         assert np.min(np.abs(cycle.multipliers - branch.multipliers.values[i, 0])) < 1e-7
     with pytest.raises(ValueError, match="`i` be the place of one of its points"):
         fj.cycle_at(branch, 10**6)
+
+
+def test_branches_over_parameters_of_one_s_own_and_coordinates_that_no_spring_holds(monkeypatch):
+    """The slider of the validation page, whose gap nothing but the load closes, by a function of its stiffness."""
+
+    def matrices(k):
+        load = np.array([0.0, -1.0])
+        return np.eye(2), np.diag([0.1, 0.0]), jnp.diag(jnp.stack([k, jnp.zeros_like(k)])), load
+
+    structure = fj.Structure.from_parameters(matrices, {"k": 1.0}, tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.ExponentialDecay(1.0, 0.5, 2.0), 1.3, fj.ConstantLoad(1.0))
+    branch = fj.continue_cycle(scene, "k", (0.9, 1.1), points=4)
+    k, period = float(branch["parameter"][0]), float(branch["period"][0])
+    assert fj.cycle_at(branch, 0).period == pytest.approx(period, rel=1e-9)
+    assert fj.limit_cycle(scene.replace(k=k)).period == pytest.approx(period, rel=1e-9)
+    monkeypatch.setattr(own_structures, "_MADE", {})
+    with pytest.raises(ValueError, match="over `k`, a parameter of a structure by a function of your own"):
+        fj.cycle_at(branch, 0)
 
 
 def test_where_modes_change_a_cycle_has_the_branch_s_multipliers(branch):
@@ -460,3 +480,17 @@ def test_long_cycles_have_the_tangents_and_corrections_of_short_ones():
     # Where another solution is left, there still is a vector that the equations leave.
     rows[0] = rows[1]
     np.testing.assert_allclose(rows @ pseudo_arclength._null_vector(rows, None), 0, atol=1e-10)
+
+
+def test_a_change_of_modes_lies_between_its_neighbours():
+    """Not where another guard grazes nearby: from 0.1592 on the impulse of the landing slips, at 0.1543 its force began to stick.
+    An independent solver's impulses reach the cone at 0.1592076.
+    """
+    scene = fj.Scene(fj.belt_oscillator(theta=0.15050915266402265), fj.Coulomb(0.227), 1.0, fj.ConstantLoad(100.0))
+    state = [-2.19633482e-03, 7.66877325e-04, 1.28055211e-03, 0.0, -5.87443988e-02, -7.85433868e-01]
+    branch = fj.continue_cycle(scene, "theta", (0.1, 0.4), fj.limit_cycle(scene, state), points=8)
+    theta, special = branch["parameter"].values, branch["special"].values
+    places = np.flatnonzero(special)
+    assert list(special[places])[-2:] == ["edge of the friction cone: slip removed", "slip inserted"]
+    np.testing.assert_allclose(theta[places][-2:], [0.154307275894, 0.159207603727], rtol=1e-10)
+    assert np.all(np.diff(theta[places[-2] - 1 :]) > 0)

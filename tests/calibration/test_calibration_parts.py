@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -220,6 +221,23 @@ def test_parameters_told_in_combination_are_grouped():
         correlation[i, j] = correlation[j, i] = value
     assert combinations(("mu", "c1", "k1", "k2"), correlation) == [(("mu", "c1", "k2"), -0.97)]
     assert combinations(("mu", "c1"), np.eye(2)) == []
+
+
+def test_bounds_are_those_given_where_the_scene_takes_them():
+    """A coupling may be negative; a coefficient of friction may not, whatever the bounds."""
+
+    def matrices(k, coupling):
+        stiffness = jnp.array([[1.0, coupling, 0.0], [coupling, k, 0.0], [0.0, 0.0, 1.0]])
+        return jnp.eye(3), 0.1 * jnp.eye(3), stiffness, jnp.array([0.0, 0.0, -1.0])
+
+    structure = fj.Structure.from_parameters(matrices, {"k": 2.0, "coupling": 0.1}, tangential=0, normal=2)
+    scene = fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.ConstantLoad(1.0))
+    wide = dict.fromkeys(("coupling", "mu"), (-0.5, 0.5))
+    free = FreeParameters(scene, ["coupling", "mu", "k"], wide)
+    np.testing.assert_array_equal(free.lower, [-0.5, 0.0, 0.0])
+    negative = scene.replace(coupling=-0.1)
+    assert float(FreeParameters(negative, ["coupling"]).lower[0]) == -np.inf
+    assert float(FreeParameters(negative, ["coupling"], {"coupling": (-0.5, 0.5)}).lower[0]) == -0.5
 
 
 def test_bounded_parameters_stay_inside_and_come_back():

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 import fivjax as fj
 from fivjax.foundation import whole_files
 from fivjax.io import files
+from fivjax.model import own_structures
 from fivjax.model.friction import AbstractFriction
 from fivjax.model.scene import IMPACT_LAWS
 from tests.helpers.refusing import refused
@@ -81,19 +82,31 @@ def test_a_scene_comes_back(structure, parts):
         assert same(fj.Scene.from_dataset(empty(scene)), scene)
 
 
-def test_a_structure_of_an_unknown_builder_comes_back_as_its_matrices():
-    """Only names of parameters are lost; refusing would lose the scene."""
+def rig(power: float) -> fj.Structure:
+    """One whose matrices are the same for k = 1, whatever the power."""
 
-    def rig(k=1e5):
-        return fj.Structure.from_parameters(
-            lambda k: (*MATRICES, jnp.array([0.0, 0.0, -1.0])), {"k": k}, tangential=0, normal=2, builder=rig
-        )
+    def matrices(k):
+        return MATRICES[0], MATRICES[1], k**power * jnp.asarray(MATRICES[2]), jnp.array([0.0, 0.0, -1.0])
 
-    scene = fj.Scene(rig(), fj.Coulomb(0.2), 3.0)
-    found = fj.Scene.from_dataset(empty(scene))
+    return fj.Structure.from_parameters(matrices, {"k": 1.0}, tangential=0, normal=2)
+
+
+def test_a_structure_by_a_function_of_one_s_own_comes_back_in_the_process_that_has_it(monkeypatch):
+    """By what the function computes, not by its name or by the matrices of one point. Elsewhere only names of parameters are
+    lost; refusing would lose the scene.
+    """
+    scene = fj.Scene(rig(2.0), fj.Coulomb(0.2), 3.0)
+    dataset, _ = empty(scene), rig(3.0)
+    found = fj.Scene.from_dataset(dataset)
+    assert float(found.replace(k=3.0).structure.stiffness[1, 1]) == 9e5
+    monkeypatch.setattr(own_structures, "_MADE", {})
+    _ = rig(3.0)
+    found = fj.Scene.from_dataset(dataset)
     assert found.structure.parameters == {}
     for name in ("mass", "damping", "stiffness", "load_direction"):
         np.testing.assert_array_equal(getattr(found.structure, name), getattr(scene.structure, name))
+    _ = rig(2.0)
+    assert set(fj.Scene.from_dataset(dataset).structure.parameters) == {"k"}
 
 
 class Steady(AbstractFriction):

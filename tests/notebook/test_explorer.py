@@ -11,6 +11,7 @@ from PIL import Image
 
 import fivjax as fj
 from fivjax.io.datasets import labelled
+from fivjax.notebook import sliders
 from fivjax.notebook.map_picture import stale
 from fivjax.notebook.panels import limits
 
@@ -76,6 +77,13 @@ def test_the_scene_itself_lies_on_the_steps_of_its_sliders(explorer, scene):
     for name, slider in explorer.sliders.items():
         steps = (float(scene.parameters[name]) - slider.min) / slider.step
         assert steps == pytest.approx(round(steps), abs=1e-6), name
+
+
+def test_sliders_of_negative_values_reach_beyond_them():
+    widgets = pytest.importorskip("ipywidgets")
+    for name, value, reached in (("belt_speed", -1.0, (-10.0, -0.1)), ("theta", -0.02, (-0.03, -0.01))):
+        made = sliders.slider(widgets, name, value, {}, {})
+        assert made.min == pytest.approx(reached[0], rel=0.02) and made.max == pytest.approx(reached[1])
 
 
 def test_what_is_said_is_of_the_scene_shown(explorer, scene):

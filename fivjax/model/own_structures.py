@@ -1,0 +1,26 @@
+"""Structures by functions of one's own that this process has made: datasets hold none of their code, and find it here."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .structure import Structure
+
+Maker = Callable[..., "Structure"]
+
+# The most functions that are remembered, the newest: a notebook may define one again and again.
+MOST = 64
+_MADE: dict[int, tuple[Callable, Maker]] = {}
+
+
+def remember(function: Callable, maker: Maker) -> None:
+    """Remember how a structure is made of its parameters, by name; `function` tells it from others."""
+    _MADE.pop(id(function), None)
+    _MADE[id(function)] = function, maker
+    if len(_MADE) > MOST:
+        del _MADE[next(iter(_MADE))]
+
+
+def remembered() -> list[Maker]:
+    """How structures of this process were made, the newest first."""
+    return [maker for _, maker in _MADE.values()][::-1]
