@@ -1,12 +1,10 @@
 """Structures by functions of one's own that this process has made: datasets hold none of their code, and find it here."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
-if TYPE_CHECKING:
-    from .structure import Structure
-
-Maker = Callable[..., "Structure"]
+# A function of a structure's parameters by name.
+Maker = Callable[..., Any]
 
 # The most functions that are remembered, the newest: a notebook may define one again and again.
 MOST = 64
