@@ -131,7 +131,8 @@ def raise_critical_perturbation(
         changed = scene.replace(**dict(zip(names, (float(x) for x in start + r * size), strict=True)))
         found = critical_perturbation(
             changed, p_range=p_range, p_step=p_step, tolerance=BRACKET, derivatives=True, progress=False
-        ).isel(belt_speed=0)
+        )
+        found = found.squeeze(found["p_crit"].dims)
         slopes = np.array([float(found["d_p_crit"].sel(parameter=name)) for name in names]) * size
         return _Iterate(changed, r, float(found["p_crit"]), slopes, _bracket(found), str(found["why_none"].values))
 
@@ -179,7 +180,8 @@ def raise_critical_perturbation(
         if following is None:
             break
         here, why = following, ""
-    anew = critical_perturbation(here.scene, p_range=p_range, p_step=p_step, progress=False).isel(belt_speed=0)
+    anew = critical_perturbation(here.scene, p_range=p_range, p_step=p_step, progress=False)
+    anew = anew.squeeze(anew["p_crit"].dims)
     ended = np.array([float(np.asarray(here.scene.parameters[name])) for name in names])
     changes = dict(zip(names, zip(start.tolist(), ended.tolist(), strict=True), strict=True))
     bracket = _bracket(anew)

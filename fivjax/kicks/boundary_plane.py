@@ -76,7 +76,8 @@ def boundary_section(
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p leads to the boundary")
     arguments.real_number("reach", reach, above=0)
     arguments.whole_number("points", points, minimum=3)
-    found = critical_perturbation(scene, p_range=p_range, progress=False).isel(belt_speed=0)
+    found = critical_perturbation(scene, p_range=p_range, progress=False)
+    found = found.squeeze(found["p_crit"].dims)
     bracket = float(found["p_crit_low"]), float(found["p_crit_high"])
     critical = critical_kick(scene, bracket, ()) if np.all(np.isfinite(bracket)) else None
     weights = weights_of(scene.structure)
