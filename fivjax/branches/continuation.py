@@ -219,6 +219,7 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
     import xarray as xr
 
     size = 2 * family.scene.structure.size
+    single = len(family.scene.structure.contacts) == 1
     states, status, direction, amplitude, slides = [], [], [], [], []
     for point in points:
         scene = family.at(point.cycle.parameter)
@@ -226,7 +227,7 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
         rest = sliding_state(scene, scene.load.final)
         at = None if point.real is None else on_section(scene, family.stepper, point.cycle.phases, point.real)
         states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
-        none = np.shape(scene.belt_speed)
+        none = () if single else len(scene.structure.contacts)
         status.append(np.full(none, -1) if at is None else at.contact.status)
         direction.append(np.full(none, np.nan) if at is None else at.contact.direction)
         amplitude.append(np.nan if point.real is None else float(point.real.seen.amplitude))
@@ -235,7 +236,7 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
     multipliers = np.stack([point.multipliers for point in points])
     largest = np.abs(multipliers[:, 0])
     names = list(family.scene.structure.coordinates)
-    each = ("point", "contact") if np.ndim(family.scene.belt_speed) else ("point",)
+    each = ("point",) if single else ("point", "contact")
     dataset = xr.Dataset(
         {
             "parameter": ("point", [point.cycle.parameter for point in points]),

@@ -282,7 +282,7 @@ def _at_end(args, _):
         after = follow(how.method, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
         return (after.y, after.contact), None
 
-    direction = jnp.sign(scene.belt_speed)
+    direction = jnp.sign(mechanics.belt_speed)
     sliding = Contact(jnp.full(direction.shape, Status.SLIDE, jnp.int32), direction)
     return jax.lax.scan(piece, (jnp.zeros(2 * n), sliding), factors)[0][0], ()
 

@@ -14,6 +14,7 @@ from ..foundation.precision import known_to_numpy
 from ..kernels.functions import KernelFunction
 from ..model.load import Pulse
 from ..model.scene import Scene
+from ..model.sliding import contact_coordinates
 from ..section.about_sliding import longest_return, mechanics_about_sliding
 from ..section.crossings import ByMethod, Kick, Point, to_crossing
 from ..steppers.event_exact import EventExact, for_derivatives
@@ -36,8 +37,9 @@ class Crossings(NamedTuple):
 
 def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:
     """Crossings after the kick of the scene's load, from steady sliding; as many as asked for, if there are so many."""
-    direction = np.sign(np.asarray(scene.belt_speed, float))
-    contact = Contact(np.full(direction.shape, Status.SLIDE, np.int32), direction)
+    each = np.shape(contact_coordinates(scene.structure)[0])
+    direction = np.broadcast_to(np.sign(np.asarray(scene.belt_speed, float)), each)
+    contact = Contact(np.full(each, Status.SLIDE, np.int32), direction)
     return _followed(scene, stepper, directions, Point(np.zeros(2 * scene.structure.size), contact), None, crossings)
 
 
