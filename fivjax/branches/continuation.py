@@ -39,7 +39,7 @@ from .multiple_shooting import Mode, Phases
 from .pseudo_arclength import Family
 from .special_derivatives import derivatives_of_special_points
 from .special_points import MEETS_SLIDING, SMOOTH
-from .verification import crossings_of, on_section
+from .verification import amplitude, crossings_of, on_section
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -220,7 +220,7 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
 
     size = 2 * family.scene.structure.size
     single = len(family.scene.structure.contacts) == 1
-    states, status, direction, amplitude, slides = [], [], [], [], []
+    states, status, direction, peaks, slides = [], [], [], [], []
     for point in points:
         scene = family.at(point.cycle.parameter)
         slides.append(bool(sliding_rates(scene)[0].real < 0))
@@ -230,9 +230,10 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
         none = () if single else len(scene.structure.contacts)
         status.append(np.full(none, -1) if at is None else at.contact.status)
         direction.append(np.full(none, np.nan) if at is None else at.contact.direction)
-        amplitude.append(np.nan if point.real is None else float(point.real.seen.amplitude))
+        peak = np.nan if point.real is None else amplitude(scene, family.stepper, point.cycle.phases, point.real)
+        peaks.append(peak)
         if point.name == MEETS_SLIDING:
-            states[-1], amplitude[-1] = rest, 0.0
+            states[-1], peaks[-1] = rest, 0.0
     multipliers = np.stack([point.multipliers for point in points])
     largest = np.abs(multipliers[:, 0])
     names = list(family.scene.structure.coordinates)
@@ -241,7 +242,7 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
         {
             "parameter": ("point", [point.cycle.parameter for point in points]),
             "period": ("point", [point.cycle.phases.period for point in points]),
-            "amplitude": ("point", amplitude),
+            "amplitude": ("point", peaks),
             "multipliers": (("point", "multiplier"), multipliers),
             "stable": ("point", largest < 1 - MARGIN),
             "sliding_stable": ("point", slides),

@@ -8,6 +8,7 @@ import numpy as np
 from ..contact import Status
 from ..cycles.one_period import PeriodSummary, follow_period
 from ..model.scene import Scene
+from ..model.sliding import contact_coordinates
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 from ..steppers.event_exact import EventExact
@@ -40,6 +41,30 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> RealMotion
     )
     seen = follow_period(scene, stepper, start, phases.period)
     return RealMotion(start, seen, phases_around(seen.segments))
+
+
+def amplitude(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotion) -> float:
+    """The peak tangential speed (m/s) of a cycle: of its real motion, unless rounding makes that touch again and again where
+    the cycle grazes, so that it comes to no end; then of the computed phases.
+    """
+    segments = real.seen.segments
+    if abs(np.sum(segments.h) - phases.period) <= 1e-9 * phases.period:
+        return float(real.seen.amplitude)
+    tangential, _ = contact_coordinates(scene.structure)
+    places = scene.structure.size + np.atleast_1d(tangential)
+    # Looks at all phases, then finer ones about the highest speed.
+    for _ in range(2):
+        states = inside(scene, stepper, phases).states
+        speeds = np.abs(states[:, :, places])
+        k, look, contact = np.unravel_index(np.argmax(speeds), speeds.shape)
+        look, step = int(np.clip(look, 1, LOOKS - 1)), phases.h[k] / LOOKS
+        phases = Phases((phases.modes[k],), states[[k], look - 1], np.array([2 * step]))
+    before, at, after = speeds[k, look - 1 : look + 2, contact]
+    if at < max(before, after):
+        # At an end of the phase.
+        return float(max(before, after))
+    bend = before - 2 * at + after
+    return float(at if bend == 0 else at - (after - before) ** 2 / (8 * bend))
 
 
 def on_section(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotion) -> Point | None:
