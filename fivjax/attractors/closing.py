@@ -71,11 +71,13 @@ def close(maps: ReturnMaps, group: Int[np.ndarray, " m"], guess: Section, crossi
         image = maps.returns(group[rows], at, count).at
         rows = rows[(_closing_error(maps, at, image) <= CLOSED) & _alike(image, at)]
         if len(rows):
-            at = best.at.rows(rows)
-            image, time, derived = maps.derived(group[rows], at, count)
-            best.crossings[rows], best.period[rows], best.jacobian[rows] = count, time, derived
-            best.residual[rows] = _closing_error(maps, at, image)
-            open_[rows] = False
+            image, time, derived = maps.derived(group[rows], best.at.rows(rows), count)
+            missed = _closing_error(maps, best.at.rows(rows), image)
+            # Not those that cross the section at once, by rounding.
+            closed = np.isfinite(missed)
+            rows = rows[closed]
+            best.crossings[rows], best.period[rows], best.jacobian[rows] = count, time[closed], derived[closed]
+            best.residual[rows], open_[rows] = missed[closed], False
     return best
 
 

@@ -134,7 +134,9 @@ def continue_cycle(
     first = point_through(family, value, point_of(cycle), cycle.period)
     if first is None:
         raise NoLimitCycle(
-            "The cycle to start from lies at a special point, where its equations are singular. Start a little beside it."
+            "The cycle to start from lies at a special point, where its equations are singular: start a little beside it. Or "
+            "the modes of two contacts end at the same instant, as where they move alike, and an impact at one changes the "
+            "other: such cycles have no branch here."
         )
     down = follow_branch(family, first, -1.0, (low, high), points)
     # A closed curve is whole by now; its first cycle is its last as well.

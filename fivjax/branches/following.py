@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ..foundation.progress import stage
 from ..linear.linearisation import sliding_rates
 from . import halves
-from .branch_points import BranchPoint, branch_point, cycle_beyond
+from .branch_points import BranchPoint, branch_point, cycle_beyond, is_real_motion
 from .mode_changes import change_of_modes, with_own_rebounds
 from .multiple_shooting import AT_SECTION
 from .pseudo_arclength import ComputedCycle, Curve, Family
@@ -179,10 +179,31 @@ def _over_a_gap(
         if found is None or not bounds[0] <= found.cycle.parameter <= bounds[1]:
             continue
         if _met_before([start, *points, found], found) is None:
-            points.append(found)
+            grazes = _grazing_between(family, last, found)
+            points += [found] if grazes is None else [grazes, found]
             tangent = found.curve.tangent(found.cycle, None)
             return found, tangent * np.sign(way * tangent[-1]), FIRST
     return None
+
+
+def _grazing_between(family: Family, last: BranchPoint, found: BranchPoint) -> BranchPoint | None:
+    """The grazing at which the cycles end that lead back from the far side of a gap, if they end in it: a lift-off with all its
+    rebounds may begin there, which is more than one change of modes.
+    """
+    tangent, back = found.curve.tangent(found.cycle, None), last.cycle.parameter - found.cycle.parameter
+    if abs(tangent[-1]) < 1e-6:
+        return None
+    step = abs(back / (family.scale * tangent[-1]))
+    tangent = tangent * np.sign(back * tangent[-1])
+    ahead = found.curve.along(found.cycle, tangent, step)
+    if ahead is None or is_real_motion(family, ahead):
+        return None
+    changed = change_of_modes(family, found, tangent, step)
+    if changed is None or changed[0].grazing is None:
+        return None
+    special = changed[0]
+    within = (special.cycle.parameter - last.cycle.parameter) * (special.cycle.parameter - found.cycle.parameter) < 0
+    return branch_point(family, special.curve, special.cycle, special) if within else None
 
 
 def _smallness(curve: Curve, cycle: ComputedCycle) -> float:

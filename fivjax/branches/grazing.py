@@ -25,7 +25,12 @@ NAMES = {
 
 def touch(mode: Mode, guard: int) -> str:
     """What it is called that a guard touches zero."""
-    return f"{NAMES[mode.of_guard(guard)]}{f' at contact {guard // 2}' if len(mode.status) > 1 else ''}"
+    return NAMES[mode.of_guard(guard)] + where(mode, guard // 2)
+
+
+def where(mode: Mode, contact: int) -> str:
+    """Which contact something happens at, if there are several."""
+    return f" at contact {contact}" if len(mode.status) > 1 else ""
 
 
 class GuardMinimum(NamedTuple):

@@ -33,16 +33,22 @@ def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray
             high, ahead = middle, cycle
     if ahead is None:
         return None
-    gone = [k for k in valid.phases.lasting() if ahead.phases.h[k] <= 0]
+    # Events of two contacts that move alike are always at once.
+    gone = [k for k in valid.phases.lasting() if ahead.phases.h[k] <= 0 and not here.cycle.phases.is_at_once(k)]
     if gone:
         return _reordered(family, curve, valid, gone[0], step) or _removed(family, curve, valid, tangent, gone[0], step)
     if turned_back := _missed(curve, here, tangent, low, high, ahead):
         return turned_back, None
     return (
         _inserted(family, curve, valid, ahead, tangent, step)
-        or _removed(family, curve, valid, tangent, min(valid.phases.lasting(), key=lambda k: valid.phases.h[k]), step)
+        or _removed(family, curve, valid, tangent, _shortest(valid.phases, here.cycle.phases), step)
         or _grazes(curve, valid, ahead)
     )
+
+
+def _shortest(phases: Phases, before: Phases) -> int:
+    lasting = phases.lasting()
+    return min([k for k in lasting if not before.is_at_once(k)] or lasting, key=lambda k: phases.h[k])
 
 
 def _missed(curve: Curve, here: BranchPoint, tangent, low: float, high: float, ahead: ComputedCycle) -> Special | None:

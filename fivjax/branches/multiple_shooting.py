@@ -101,15 +101,19 @@ class Phases(NamedTuple):
         """The modes of what is no such short rebound, each with the guards that end it: those of two contacts, if these end at
         once, but for rounding. Then either may be first.
         """
-        at_once = 1e-12 * self.period
         found: list[tuple] = []
         for k in self.lasting(shortest):
-            (status, direction, ending), before = self.modes[k], self.modes[k - 1].ending
-            if found and abs(self.h[k]) <= at_once and before // 2 != ending // 2:
+            status, direction, ending = self.modes[k]
+            if found and self.is_at_once(k):
                 found[-1] = *found[-1][:2], found[-1][2] | {ending}
             else:
                 found.append((status, direction, frozenset({ending})))
         return tuple(found)
+
+    def is_at_once(self, k: int) -> bool:
+        """Whether a phase begins and ends by events of two contacts at the same instant, but for rounding."""
+        before, ending = self.modes[k - 1].ending, self.modes[k].ending
+        return before // 2 != ending // 2 and abs(self.h[k]) <= 1e-9 * self.period
 
     def lasting(self, shortest: float = SHORTEST_REBOUNDS[0]) -> list[int]:
         """The phases that are no rebounds shorter than this share of the period."""

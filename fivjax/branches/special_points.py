@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..contact import Status
-from .grazing import Grazing, grazing_near, guard_minima, touch
+from .grazing import Grazing, grazing_near, guard_minima, touch, where
 from .multiple_shooting import AT_SECTION, Mode, Phases, same_modes
 from .pseudo_arclength import ComputedCycle, Curve, multipliers_of
 
@@ -38,6 +38,7 @@ class Change(NamedTuple):
     phase: int  # the phase of the longer sequence that vanishes, or at which two phases become one
     merges: bool  # whether its neighbours become one phase, inside which a guard then touches zero
     word: str  # the mode or event that is inserted or removed
+    where: str  # at which contact, if there are several
 
 
 # ------------------------------------------------------------------------------------------------------ smooth branches
@@ -147,28 +148,31 @@ def change_between(longer: Sequence[Mode], shorter: Sequence[Mode]) -> Change | 
         # Without any event the section takes the place of one.
         extra = [i for i in range(count) if not alike(longer[i], shorter[0])]
         return (
-            Change(extra[0], True, _inserted(longer[extra[0]], shorter[0])) if count == 2 and len(extra) == 1 else None
+            Change(extra[0], True, *_inserted(longer[extra[0]], shorter[0])) if count == 2 and len(extra) == 1 else None
         )
     for i in range(count):
         before, after = longer[i - 1], longer[(i + 1) % count]
         if count - len(shorter) == 2 and alike(before, after) and count > 2:
             kept = [mode for j, mode in enumerate(longer) if j not in (i, (i - 1) % count)]
             if same_modes(tuple(kept), shorter):
-                return Change(i, True, _inserted(longer[i], after))
+                return Change(i, True, *_inserted(longer[i], after))
         if count - len(shorter) == 1:
             kept = longer[:i] + longer[i + 1 :]
             if same_modes(kept, shorter):
                 split = alike(longer[i], after) and longer[i].ending != after.ending
                 split = split or (alike(longer[i], after) and longer[i].lands)
-                return Change(i, split, "impact" if split else _inserted(longer[i], after))
+                if split:
+                    return Change(i, split, "impact", where(longer[i], longer[i].ending // 2))
+                return Change(i, split, *_inserted(longer[i], after))
     return None
 
 
-def _inserted(mode: Mode, after: Mode) -> str:
-    """What the contact does in a mode that does something else after it."""
+def _inserted(mode: Mode, after: Mode) -> tuple[str, str]:
+    """What the contact does in a mode that does something else after it, and which contact."""
     changed = [mode.mode_of(contact) != after.mode_of(contact) for contact in range(len(mode.status))]
-    status = mode.status[changed.index(True) if any(changed) else 0]
-    return {Status.STICK: "stick", Status.SLIDE: "slip", Status.DETACH: "lift-off"}[Status(status)]
+    contact = changed.index(True) if any(changed) else 0
+    words = {Status.STICK: "stick", Status.SLIDE: "slip", Status.DETACH: "lift-off"}
+    return words[Status(mode.status[contact])], where(mode, contact)
 
 
 def grazing_of(curve: Curve, guess: ComputedCycle, lowest: int = 4) -> Grazing | None:
@@ -191,12 +195,13 @@ def vanishing(curve: Curve, guess: ComputedCycle, phase: int) -> Special | None:
 
 def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> str:
     """The name of a change of the modes."""
-    what = "" if change is None else f"{change.word} {'removed' if removed else 'inserted'}"
+    what = "" if change is None else f"{change.word} {'removed' if removed else 'inserted'}{change.where}"
     if grazing is None:
         return what or "contact modes change"
     mode = grazing.cycle.phases.modes[grazing.minimum.phase]
     how = touch(mode, grazing.minimum.guard)
-    return f"{how}: {what}" if what else how
+    # A contact that is named once need not be named again.
+    return f"{how}: {what.removesuffix(where(mode, grazing.minimum.guard // 2))}" if what else how
 
 
 def without(phases: Phases, change: Change, shorter: Sequence[Mode]) -> Phases | None:

@@ -180,8 +180,11 @@ def _structure(description: Mapping) -> Structure:
 
 
 def _is_described(structure: Structure, description: Mapping) -> bool:
-    """Whether it has the matrices and coordinates of a description: a user's own function may have the name of another."""
-    if list(structure.coordinates) != description["coordinates"]:
+    """Whether it has the matrices, coordinates and contacts of a description: a user's own function may have the name of
+    another, or be used with other contacts.
+    """
+    own = {**_places(structure), "coordinates": list(structure.coordinates)}
+    if json.loads(json.dumps(own)) != {name: description.get(name) for name in own}:
         return False
     for name in MATRICES:
         own, other = np.asarray(getattr(structure, name)), np.asarray(description[name])

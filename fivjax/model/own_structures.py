@@ -1,6 +1,6 @@
 """Structures by functions of one's own that this process has made: datasets hold none of their code, and find it here."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 # A function of a structure's parameters by name.
@@ -8,13 +8,14 @@ Maker = Callable[..., Any]
 
 # The most functions that are remembered, the newest: a notebook may define one again and again.
 MOST = 64
-_MADE: dict[int, tuple[Callable, Maker]] = {}
+_MADE: dict[Hashable, tuple[Callable, Maker]] = {}
 
 
-def remember(function: Callable, maker: Maker) -> None:
-    """Remember how a structure is made of its parameters, by name; `function` tells it from others."""
-    _MADE.pop(id(function), None)
-    _MADE[id(function)] = function, maker
+def remember(function: Callable, settings: Hashable, maker: Maker) -> None:
+    """Remember how a structure is made of its parameters, by name; the `function` and its `settings` tell it from others."""
+    key = id(function), settings
+    _MADE.pop(key, None)
+    _MADE[key] = function, maker
     if len(_MADE) > MOST:
         del _MADE[next(iter(_MADE))]
 

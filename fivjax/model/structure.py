@@ -243,6 +243,7 @@ class Structure(eqx.Module):
         settings = {"contacts": checked.contacts, "coordinates": checked.coordinates, "dampers": dampers}
         remember(
             matrices_of if builder is None else builder,
+            (checked.places, checked.coordinates, dampers),
             builder or (lambda **values: cls.from_parameters(matrices_of, values, **settings)),
         )
         return eqx.tree_at(lambda s: s.source, checked, source)

@@ -244,14 +244,20 @@ class ReturnMaps:
     def derived(
         self, group, at: Section, crossings
     ) -> tuple[Section, Float[np.ndarray, " m"], Float[np.ndarray, "m 2n 2n"]]:
-        """The same crossing, its time (s), and the derivative of the map, for deviations that a row's contact mode allows."""
+        """The same crossing, its time (s), and the derivative of the map, for deviations that a row's contact mode allows. NaN
+        for what is no return, because it takes no time: a state next to the section may cross it at once, by rounding.
+        """
         if self.kernels is not None and not self.kernels.has_derivatives:
-            return self._differences(group, at, crossings)
-        if self.kernels is not None:
-            (*section, time), derivatives = self.kernels.derived(group, *at, crossings)
+            section, time, derivatives = self._differences(group, at, crossings)
+        elif self.kernels is not None:
+            (*found, time), derivatives = self.kernels.derived(group, *at, crossings)
+            section = Section(*found)
         else:
-            (*section, time), derivatives = self._exactly(_derived, DERIVED_BLOCK, group, at, crossings)
-        return Section(*section), time, derivatives
+            (*found, time), derivatives = self._exactly(_derived, DERIVED_BLOCK, group, at, crossings)
+            section = Section(*found)
+        _, longest = self.shared
+        lasts = time > 1e-10 * longest[group]
+        return section._replace(y=np.where(lasts[:, None], section.y, np.nan)), time, derivatives
 
     def peaks(self, group, at: Section, crossings) -> Float[np.ndarray, " m"]:
         """The largest tangential speed (m/s) on the way to the `crossings`-th crossing from each row."""

@@ -494,3 +494,17 @@ def test_a_change_of_modes_lies_between_its_neighbours():
     assert list(special[places])[-2:] == ["edge of the friction cone: slip removed", "slip inserted"]
     np.testing.assert_allclose(theta[places][-2:], [0.154307275894, 0.159207603727], rtol=1e-10)
     assert np.all(np.diff(theta[places[-2] - 1 :]) > 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("restitution", [0.2, 0.4])
+def test_where_a_lift_off_begins_does_not_depend_on_restitution(restitution):
+    """Nothing has struck there yet; but beyond, all its rebounds begin at once."""
+    branches = [
+        fj.continue_cycle(paper(1.0, 0.2).replace(restitution=e), "mu", (0.165, 0.215)) for e in (0.0, restitution)
+    ]
+    mu = [
+        float(branch["parameter"].values[branch["special"].str.startswith("grazing of N").values][0])
+        for branch in branches
+    ]
+    assert mu[1] == pytest.approx(mu[0], rel=1e-11) and mu[0] == pytest.approx(0.182125040747, rel=1e-10)

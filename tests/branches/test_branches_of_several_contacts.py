@@ -139,3 +139,33 @@ def test_points_of_branches_are_cycles_with_the_multipliers_of_their_own_motion(
         np.testing.assert_allclose(
             np.delete(own, np.argmin(np.abs(own - 1)))[:4], np.abs(row["multipliers"][:4]), rtol=1e-8
         )
+
+
+@pytest.mark.slow
+def test_a_torus_of_several_contacts_as_start_gives_a_cycle_that_takes_time():
+    """A state beside the section crosses it at once, by rounding: that is no period."""
+    laws = [fj.Coulomb(0.2, 0.24), fj.Coulomb(0.18, 0.2)]
+    scene = fj.Scene(coupled(2), laws, np.array([1.0, 1.3]), fj.ConstantLoad(100.0), np.array([0.0, 0.3]))
+    torus = fj.limit_cycle(scene)
+    assert torus.kind == "torus"
+    cycle = fj.limit_cycle(scene, torus)
+    assert cycle.period == pytest.approx(torus.period, rel=0.01) and np.abs(cycle.multipliers[0]) > 1
+
+
+@pytest.mark.slow
+def test_of_contacts_that_move_alike_no_special_point_is_made_of_the_order_of_their_events():
+    """The cycle of one of them: its fold, and where it lifts off."""
+    mass, damping, stiffness, load = (np.array(matrix) for matrix in copies(2).matrices)
+    for matrix, value in ((stiffness, 1e6), (damping, 200.0)):
+        matrix[np.ix_([0, 3], [0, 3])] += value * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    one = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.175), 1.0, fj.ConstantLoad(100.0))
+    structure = fj.Structure(mass, damping, stiffness, load, contacts=copies(2).contacts)
+    pair = fj.Scene(structure, fj.Coulomb(0.175), np.ones(2), fj.ConstantLoad(100.0))
+    displacement, velocity = np.split(np.asarray(fj.limit_cycle(one).state), 2)
+    start = np.concatenate([displacement, displacement, velocity, velocity])
+    branch = fj.continue_cycle(pair, "mu", (0.16, 0.22), fj.limit_cycle(pair, start))
+    named = {
+        str(name): float(mu) for name, mu in zip(branch["special"].values, branch["parameter"], strict=True) if name
+    }
+    assert named.pop("fold") == pytest.approx(0.167966615703, rel=1e-9)
+    assert all(mu == pytest.approx(0.182125040747, rel=1e-8) for mu in named.values())

@@ -91,6 +91,22 @@ def rig(power: float) -> fj.Structure:
     return fj.Structure.from_parameters(matrices, {"k": 1.0}, tangential=0, normal=2)
 
 
+def test_a_structure_comes_back_with_its_own_contacts():
+    """The same function and numbers made another one, later."""
+
+    def matrices(k):
+        return jnp.eye(4), 0.1 * jnp.eye(4), k * jnp.eye(4), jnp.array([0.0, -1.0, 0.0, -2.0])
+
+    def scene(*pairs):
+        contacts = [fj.ContactPoint(*pair) for pair in pairs]
+        return fj.Scene(fj.Structure.from_parameters(matrices, {"k": 1.0}, contacts=contacts), fj.Coulomb(0.2), 1.0)
+
+    first, second = scene((0, 1), (2, 3)), scene((2, 3), (0, 1))
+    for one in (first, second):
+        found = fj.Scene.from_dataset(empty(one))
+        assert found.structure.places == one.structure.places and set(found.structure.parameters) == {"k"}
+
+
 def test_a_structure_by_a_function_of_one_s_own_comes_back_in_the_process_that_has_it(monkeypatch):
     """By what the function computes, not by its name or by the matrices of one point. Elsewhere only names of parameters are
     lost; refusing would lose the scene.
