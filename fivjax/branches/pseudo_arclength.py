@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 from ..contact import Status
 from ..model.directions import moved_along
 from ..model.scene import Scene
-from ..section.return_maps import weights_of
+from ..section.about_sliding import weights_of
 from ..steppers.event_exact import EventExact
 from .multiple_shooting import AT_SECTION, Mode, PhaseImages, Phases, images
 

@@ -20,8 +20,7 @@ from ..maps.basin_map import verdicts_from
 from ..model.directions import directions_of
 from ..model.load import Pulse
 from ..model.scene import Scene
-from ..section.about_sliding import sliding_state
-from ..section.return_maps import weights_of
+from ..section.about_sliding import sliding_state, weights_of
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
 from .critical import critical_perturbation

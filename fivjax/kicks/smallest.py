@@ -25,7 +25,7 @@ from ..foundation.progress import reported
 from ..maps.groups import OF_KICK
 from ..model.load import Pulse
 from ..model.scene import Scene
-from ..section.return_maps import weights_of
+from ..section.about_sliding import weights_of
 from ..verdicts.sliding_proof import envelope_peak
 from .critical import critical_perturbation
 from .perturbations import stable_sliding

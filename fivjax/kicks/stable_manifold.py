@@ -22,8 +22,9 @@ from ..contact import Contact
 from ..foundation.precision import in_double_precision
 from ..model.directions import directions_of
 from ..model.scene import Scene
+from ..section.about_sliding import weights_of
 from ..section.crossings import Point
-from ..section.return_maps import ReturnMaps, weights_of
+from ..section.return_maps import ReturnMaps
 from ..steppers.event_exact import EventExact
 from .response import MOST_CROSSINGS, Crossings, kicked, returned, started
 

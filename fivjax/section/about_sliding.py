@@ -41,6 +41,12 @@ def slowest_period(structure: Structure) -> Float[Array, ""]:
     return 2 * math.pi / jnp.sqrt(jnp.min(jnp.where(rates > 0, rates, jnp.inf)))
 
 
+def weights_of(structure: Structure) -> Float[np.ndarray, " state"]:
+    """`Structure.weights`, all of them positive: a coordinate that no spring holds has no weight of its own."""
+    weights = np.asarray(structure.weights)
+    return np.where(weights > 0, weights, np.min(weights[weights > 0]))
+
+
 def longest_return(scene: Scene) -> Float[Array, ""]:
     r"""A time (s) within which any sustained motion crosses the section.
 

@@ -25,7 +25,7 @@ from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.section import FADED
-from .about_sliding import longest_return, mechanics_about_sliding
+from .about_sliding import longest_return, mechanics_about_sliding, weights_of
 from .by_kernel import SectionKernels, section_kernels
 from .crossings import Point, to_crossing
 from .free_directions import directions_of_several, free_on_section, jumped_to, section_row
@@ -96,12 +96,6 @@ class Images(NamedTuple):
     time: Float[np.ndarray, " m"]  # s
     path: Float[np.ndarray, "m kept 2n"]  # the last states on the section, newest last; NaN if there were fewer
     peak: Float[np.ndarray, " m"]  # the largest tangential speed on the way, m/s; 0 unless asked for
-
-
-def weights_of(structure: Structure) -> Float[np.ndarray, " state"]:
-    """`Structure.weights`, all of them positive: a coordinate that no spring holds has no weight of its own."""
-    weights = np.asarray(structure.weights)
-    return np.where(weights > 0, weights, np.min(weights[weights > 0]))
 
 
 class ReturnMaps:
