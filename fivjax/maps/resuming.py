@@ -45,7 +45,8 @@ def keeper_at(
         **{package: metadata.version(package) for package in packages},
         **kernels_by(method, scene),
         "device": jax.devices()[0].device_kind,
-        "scene": describe(scene),
+        # What the structure's function computes is among the code below.
+        "scene": {name: value for name, value in describe(scene).items() if name != "structure_code"},
         "method": re.sub(r" at 0x[0-9a-f]+", "", repr(method)),
         "code": code_of(scene) | _code_of_method(method, scene),
         **limits,
