@@ -221,7 +221,8 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
     import xarray as xr
 
     size = 2 * family.scene.structure.size
-    single = len(family.scene.structure.contacts) == 1
+    count = len(family.scene.structure.contacts)
+    each, none = (("point",), ()) if count == 1 else (("point", "contact"), (count,))
     states, status, direction, peaks, slides = [], [], [], [], []
     for point in points:
         scene = family.at(point.cycle.parameter)
@@ -229,17 +230,14 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
         rest = sliding_state(scene, scene.load.final)
         at = None if point.real is None else on_section(scene, family.stepper, point.cycle.phases, point.real)
         states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
-        none = () if single else len(scene.structure.contacts)
         status.append(np.full(none, -1) if at is None else at.contact.status)
         direction.append(np.full(none, np.nan) if at is None else at.contact.direction)
-        peak = np.nan if point.real is None else amplitude(scene, family.stepper, point.cycle.phases, point.real)
-        peaks.append(peak)
+        peaks.append(np.nan if point.real is None else amplitude(scene, family.stepper, point.cycle.phases, point.real))
         if point.name == MEETS_SLIDING:
             states[-1], peaks[-1] = rest, 0.0
     multipliers = np.stack([point.multipliers for point in points])
     largest = np.abs(multipliers[:, 0])
     names = list(family.scene.structure.coordinates)
-    each = ("point",) if single else ("point", "contact")
     dataset = xr.Dataset(
         {
             "parameter": ("point", [point.cycle.parameter for point in points]),

@@ -36,7 +36,7 @@ def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray
     # Events of two contacts that move alike are always at once.
     gone = [k for k in valid.phases.lasting() if ahead.phases.h[k] <= 0 and not here.cycle.phases.is_at_once(k)]
     if gone:
-        return _reordered(family, curve, valid, gone[0], step) or _removed(family, curve, valid, tangent, gone[0], step)
+        return _reordered(family, curve, valid, gone[0]) or _removed(family, curve, valid, tangent, gone[0], step)
     if turned_back := _missed(curve, here, tangent, low, high, ahead):
         return turned_back, None
     return (
@@ -135,15 +135,10 @@ def _removed(family: Family, curve: Curve, valid: ComputedCycle, tangent, phase:
         special = Special("", curve, valid) if found is None else found
         special = special._replace(name=name_of(None, change, removed=True))
         away = _outward(family, fewer, first, away, special.cycle)
-    begin = special.cycle if special.curve is fewer else first
-    for length in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
-        onward = fewer.along(begin, away, length)
-        if onward is not None and is_real_motion(family, onward):
-            return special, (branch_point(family, fewer, onward), fewer.tangent(onward, away), max(length, 1e-3))
-    return special, None
+    return special, _onward(family, fewer, special.cycle if special.curve is fewer else first, away)
 
 
-def _reordered(family: Family, curve: Curve, valid: ComputedCycle, phase: int, step: float):
+def _reordered(family: Family, curve: Curve, valid: ComputedCycle, phase: int):
     """A change beyond which two contacts have their events in the other order, if the phase between these vanishes."""
     modes = list(curve.modes)
     before, own, after = modes[phase - 1], modes[phase], modes[(phase + 1) % len(modes)]
@@ -176,14 +171,16 @@ def _reordered(family: Family, curve: Curve, valid: ComputedCycle, phase: int, s
     away = other.tangent(begin, None)
     away = away * np.sign(away[len(other.of_state) + phase])
     special = special._replace(name="the events of two contacts change their order")
+    onward = _onward(family, other, begin, away)
+    return None if onward is None else (special, onward)
+
+
+def _onward(family: Family, curve: Curve, begin: ComputedCycle, away: Float[np.ndarray, " m"]):
+    """The point, tangent and step with which to go on along a curve, from the first of its cycles that is a real motion."""
     for length in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
-        onward = other.along(begin, away, length)
-        if onward is not None and is_real_motion(family, onward):
-            return special, (
-                branch_point(family, other, onward),
-                other.tangent(onward, away),
-                max(length, min(step, 1e-3)),
-            )
+        cycle = curve.along(begin, away, length)
+        if cycle is not None and is_real_motion(family, cycle):
+            return branch_point(family, curve, cycle), curve.tangent(cycle, away), max(length, 1e-3)
     return None
 
 

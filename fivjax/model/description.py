@@ -3,7 +3,6 @@
 A dataset's attributes hold everything that defines its scene, so that `Scene.from_dataset` needs no other file.
 """
 
-import contextlib
 import dataclasses
 import html
 import json
@@ -161,22 +160,25 @@ def _structure(description: Mapping) -> Structure:
             if _is_described(built, description):
                 return built
     if "structure_code" in description:
-        parameters = {name: description["parameters"][name] for name in description["of_structure"]}
         for maker in remembered():
-            with contextlib.suppress(
-                Exception
-            ):  # of any kind: the code is somebody else's, and may take other parameters
-                built = maker(**parameters)
-                same = (
-                    set(built.parameters) == set(parameters)
-                    and code_of_structure(built) == description["structure_code"]
-                )
-                if same and _is_described(built, description):
-                    return built
+            remade = _remade(maker, description)
+            if remade is not None:
+                return remade
     places = {name: description[name] for name in ("tangential", "normal", "coordinates") if name in description}
     if "contacts" in description:
         places["contacts"] = [ContactPoint(pair["tangential"], pair["normal"]) for pair in description["contacts"]]
     return Structure(**{name: np.asarray(description[name]) for name in MATRICES}, **places)
+
+
+def _remade(maker, description: Mapping) -> Structure | None:
+    """What a function of somebody's makes of the described parameters, if it is the structure that is described."""
+    parameters = {name: description["parameters"][name] for name in description["of_structure"]}
+    try:
+        made = maker(**parameters)
+        same = set(made.parameters) == set(parameters) and code_of_structure(made) == description["structure_code"]
+        return made if same and _is_described(made, description) else None
+    except Exception:  # of any kind, because the code is somebody else's; it may take other parameters
+        return None
 
 
 def _is_described(structure: Structure, description: Mapping) -> bool:

@@ -338,7 +338,7 @@ def _painleve_friction(structure: Structure):
     return jnp.where(coupling == 0, jnp.inf, compliance[1, 1] / jnp.where(coupling == 0, 1.0, coupling))
 
 
-def refuse_several_contacts(structure: Structure, who: str, instead: str = "`simulate` takes several.") -> None:
+def refuse_several_contacts(structure: Structure, who: str, instead: str) -> None:
     """Refuse anything but one contact at two coordinates; `who`, the function that needs this, is named in the error, and what
     there is `instead`.
     """

@@ -240,12 +240,12 @@ class Structure(eqx.Module):
                 "over them demand. NumPy, `math` and `if` need the numbers; `jnp.array`, `jnp.sqrt` and `jnp.where` do not."
             ) from error
         checked = cls(*matrices, tangential, normal, contacts=contacts, coordinates=coordinates)
-        settings = {"contacts": checked.contacts, "coordinates": checked.coordinates, "dampers": dampers}
-        remember(
-            matrices_of if builder is None else builder,
-            (checked.places, checked.coordinates, dampers),
-            builder or (lambda **values: cls.from_parameters(matrices_of, values, **settings)),
-        )
+        if builder is not None:
+            remember(builder, None, builder)
+        else:
+            settings = {"contacts": checked.contacts, "coordinates": checked.coordinates, "dampers": dampers}
+            maker = functools.partial(cls.from_parameters, matrices_of, **settings)
+            remember(matrices_of, (checked.places, checked.coordinates, dampers), lambda **values: maker(values))
         return eqx.tree_at(lambda s: s.source, checked, source)
 
     @property

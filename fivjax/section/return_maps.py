@@ -243,11 +243,12 @@ class ReturnMaps:
         """
         if self.kernels is not None and not self.kernels.has_derivatives:
             section, time, derivatives = self._differences(group, at, crossings)
-        elif self.kernels is not None:
-            (*found, time), derivatives = self.kernels.derived(group, *at, crossings)
-            section = Section(*found)
         else:
-            (*found, time), derivatives = self._exactly(_derived, DERIVED_BLOCK, group, at, crossings)
+            (*found, time), derivatives = (
+                self._exactly(_derived, DERIVED_BLOCK, group, at, crossings)
+                if self.kernels is None
+                else self.kernels.derived(group, *at, crossings)
+            )
             section = Section(*found)
         _, longest = self.shared
         lasts = time > 1e-10 * longest[group]
