@@ -1,10 +1,9 @@
-"""HDF5 files, which NetCDF and MATLAB 7.3 files are: read in a process of its own, which a damaged one may crash."""
+"""NetCDF files, which are HDF5: read in a process of its own, which a damaged one may crash."""
 
 from pathlib import Path
 
 import numpy as np
 
-from . import sparse_parts
 from .reading_limits import unreadable
 from .separate_reading import parts_of
 
@@ -28,41 +27,14 @@ def read_netcdf(path: Path) -> tuple[dict, dict[str, tuple[list[str], np.ndarray
     **Raises:** `ValueError` for a file that is damaged, or whose data are in other files.
     """
     attributes, variables = {}, {}
-    for about, values in _parts(path, "netcdf", "NetCDF"):
+    if not is_hdf5(path):
+        raise unreadable(path, "NetCDF", "it does not begin as such a file does")
+    for about, values in parts_of(path, "netcdf", "NetCDF"):
         if "name" not in about:
             attributes = _attributes(about["attrs"])
         else:
             variables[about["name"]] = (about["dims"], values, _attributes(about["attrs"]))
     return attributes, variables
-
-
-def read_matlab(path: Path) -> dict:
-    """The variables of a MATLAB 7.3 file by name: arrays and sparse matrices, and None for each that holds no numbers.
-
-    **Raises:** `ValueError` for a file that is damaged, or whose data are in other files.
-    """
-    found, rows, parts = {}, {}, {}
-    for about, values in _parts(path, "matlab", "MATLAB"):
-        name = about["name"]
-        if "rows" in about:
-            rows[name] = about["rows"]
-        elif "/" in name:
-            parts[name] = values
-        elif name:
-            found[name] = None if values is None else values.T  # stored column by column
-    for name, count in rows.items():
-        starts = parts.get(f"{name}/jc", np.zeros(0, int))
-        # A matrix of zeros has no data.
-        data, entries = parts.get(f"{name}/data", np.zeros(0)), parts.get(f"{name}/ir", np.zeros(0, int))
-        shape = (count, max(starts.size - 1, 0))
-        found[name] = sparse_parts.compressed(path, "MATLAB", "csc", data, entries, starts, shape)
-    return found
-
-
-def _parts(path: Path, what: str, kind: str):
-    if not is_hdf5(path):
-        raise unreadable(path, kind, "it does not begin as such a file does")
-    return parts_of(path, what, kind)
 
 
 def _attributes(sent: dict) -> dict:

@@ -1,15 +1,17 @@
 """What runs in a process of its own to read a file with a library that a damaged one may crash: it imports nothing of fivjax.
 
-On some damaged files the HDF5 library crashes or never returns, and pyyeti, which reads OUTPUT4, makes room for whatever a
-header declares. Here that cannot harm the caller. By itself the HDF5 library also reads whatever other files a file names;
-that is refused. What was read goes out as numbers and text: for each variable a line of JSON and the bytes of its array.
-Nothing is pickled.
+On some damaged files the HDF5 library crashes or never returns, SciPy's reader of MATLAB files crashes, and pyyeti, which
+reads OUTPUT4, makes room for whatever a header declares. Here that cannot harm the caller. By itself the HDF5 library also
+reads whatever other files a file names; that is refused. What was read goes out as numbers and text: for each variable a line
+of JSON and the bytes of its array. Nothing is pickled.
 """
 
+import importlib
 import json
 import math
 import sys
 import types
+import warnings
 from importlib.util import find_spec
 
 # Filters of the HDF5 library itself (deflate, shuffle, Fletcher's checksum, SZIP, N-bit, scale and offset) and of h5py (LZF).
@@ -20,7 +22,8 @@ OBJECTS, ATTRIBUTES, TEXT = 20_000, 5_000, 2**28
 # The libraries of each function here.
 LIBRARIES = {
     "netcdf": ("h5netcdf",),
-    "matlab": ("h5py",),
+    "matlab": ("scipy.io", "scipy.sparse"),
+    "matlab73": ("h5py",),
     "output4": ("numpy", "scipy.sparse", "pyyeti.nastran.op4"),
 }
 # The line that says that what a function here needs has been imported: the time of a reading counts from there.
@@ -90,7 +93,28 @@ def netcdf(path: str, send) -> None:
 
 
 def matlab(path: str, send) -> None:
-    """Send the arrays of a MATLAB 7.3 file, and the parts of its sparse matrices, under `name/part`."""
+    """Send the arrays of a MATLAB file before version 7.3, and the parts of its sparse matrices, as `matlab73` does."""
+    from scipy import io, sparse
+
+    # Of two variables with one name, and of a damaged one, the library only warns.
+    with warnings.catch_warnings(action="error"):
+        variables = io.loadmat(path, appendmat=False)
+    for name in variables:
+        if not name.startswith("__"):
+            value, name = variables[name], _check_name(name)
+            if sparse.issparse(value):
+                columns = value.tocsc()
+                send({"name": name, "rows": columns.shape[0]})
+                for part, values in (("jc", columns.indptr), ("ir", columns.indices), ("data", columns.data)):
+                    _send_array(send, {"name": f"{name}/{part}"}, values)
+            elif getattr(value, "dtype", None) is not None and value.dtype.kind in "biufc":
+                _send_array(send, {"name": name}, value.T)
+            else:
+                send({"name": name})
+
+
+def matlab73(path: str, send) -> None:
+    """Send the arrays of a MATLAB 7.3 file, column by column, and the parts of its sparse matrices, under `name/part`."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -189,6 +213,9 @@ def _printable(name: str) -> str:
     return "".join(character if character.isprintable() else "?" for character in name)[:80]
 
 
+READERS = {"netcdf": netcdf, "matlab": matlab, "matlab73": matlab73, "output4": output4}
+
+
 def run(kind: str, path: str, out) -> None:
     """Read a file and write what is in it to the stream `out`; the last line says how it ended."""
 
@@ -199,7 +226,7 @@ def run(kind: str, path: str, out) -> None:
         out.flush()
 
     try:
-        {"netcdf": netcdf, "matlab": matlab, "output4": output4}[kind](path, send)
+        READERS[kind](path, send)
         send({"end": ""})
     except Refused as refusal:
         send({"end": str(refusal)})
@@ -236,14 +263,8 @@ def import_libraries(kind: str) -> None:
         package = types.ModuleType("pyyeti.nastran")
         package.__path__ = [f"{folder}/nastran" for folder in found.submodule_search_locations or ()]
         sys.modules["pyyeti.nastran"] = package
-    if kind == "netcdf":
-        import h5netcdf  # noqa: F401
-    elif kind == "matlab":
-        import h5py  # noqa: F401
-    else:
-        import numpy  # noqa: F401
-        import pyyeti.nastran.op4  # noqa: F401
-        import scipy.sparse  # noqa: F401
+    for name in LIBRARIES[kind]:
+        importlib.import_module(name)
 
 
 if __name__ == "__main__":

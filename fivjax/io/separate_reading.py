@@ -71,8 +71,8 @@ def _reading(path: Path, what: str, length: int) -> Iterator[IO[bytes]]:
     free = free_memory()
     memory = COPIES * max(SMALL, PACKED * length)
     memory = BESIDE + (memory if free is None else min(memory, free))
-    rates = {"netcdf": 10_000_000, "matlab": 10_000_000, "output4": 500_000}
-    needed = math.ceil(length / rates[what])
+    # Bytes that are read in a second at the slowest.
+    needed = math.ceil(length / (500_000 if what == "output4" else 10_000_000))
     command = [
         sys.executable,
         "-P",

@@ -85,7 +85,7 @@ def test_sizes_that_the_file_cannot_hold(tmp_path):
     np.save(tmp_path / "K.npy", np.eye(2))
     content = (tmp_path / "K.npy").read_bytes().replace(b"(2, 2), }        ", b"(200000000, 2), }")
     (tmp_path / "K.npy").write_bytes(content)
-    with pytest.raises(ValueError, match=r"declares shape \(200000000, 2\) of float64, but 32 bytes follow"):
+    with pytest.raises(ValueError, match=r"cannot be read as NumPy: EOF: reading array data, .* got 32"):
         fj.read_matrices(tmp_path / "K.npy")
 
 
@@ -100,7 +100,7 @@ def test_damaged_recordings(tmp_path):
     (tmp_path / "r.wav").write_bytes(struct.pack("<4sI", b"RIFF", len(content)) + content)
     for name, said in (
         ("r.npz", "NumPy: Bad CRC-32"),
-        ("r.mat", "MATLAB: a packed variable"),
+        ("r.mat", "MATLAB: error: .* while decompressing data"),
         ("r.wav", "WAV: it declares 0"),
     ):
         with pytest.raises(ValueError, match=f"cannot be read as {said}"):
