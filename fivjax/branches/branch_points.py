@@ -62,11 +62,11 @@ def point_through(family: Family, parameter: float, start: SectionPoint, period:
     return None if cycle is None else branch_point(family, curve, cycle)
 
 
-def cycle_beyond(family: Family, last: BranchPoint, sense: float) -> BranchPoint | None:
-    """A cycle much like a point's for somewhat larger (`sense` 1) or smaller (-1) values of the parameter, closed on the
-    section: there may be many changes of modes in between, as where a chain of rebounds ends no longer.
+def cycle_beyond(family: Family, last: BranchPoint, at: float, sense: float) -> BranchPoint | None:
+    """A cycle much like a point's for somewhat larger (`sense` 1) or smaller (-1) values of the parameter than `at`, closed on
+    the section: there may be many changes of modes in between, as where a chain of rebounds ends no longer.
     """
-    at, phases, scene = last.cycle.parameter, last.cycle.phases, family.at(last.cycle.parameter)
+    phases, scene = last.cycle.phases, family.at(last.cycle.parameter)
     start = None if last.real is None else on_section(scene, family.stepper, phases, last.real)
     crossings = None if start is None else crossings_of(ReturnMaps.of(scene), start)
     if start is None or crossings is None:

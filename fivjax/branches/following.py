@@ -1,5 +1,6 @@
 """Following a branch of cycles: its steps and its ends."""
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -174,8 +175,9 @@ def _over_a_gap(
     """
     before, last = [start, start, *points][-2:]
     onwards = np.sign(last.cycle.parameter - before.cycle.parameter) or sense
-    for way in (onwards, -onwards) if points else (sense,):
-        found = cycle_beyond(family, last, way)
+    for way, near in itertools.product((onwards, -onwards) if points else (sense,), (last, before)):
+        # At a special point rounding tells how the motion goes on.
+        found = cycle_beyond(family, near, last.cycle.parameter, way)
         if found is None or not bounds[0] <= found.cycle.parameter <= bounds[1]:
             continue
         if _met_before([start, *points, found], found) is None:

@@ -7,11 +7,16 @@ Newton's method finds it to rounding, and the implicit function theorem differen
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..contact import Status
-from .multiple_shooting import Mode, PhaseImages, Phases, images_of_phases, inside
+from ..foundation.numpy_evaluation import by_numpy
+from ..model.scene import Scene
+from ..model.sliding import contact_coordinates
+from ..section.about_sliding import mechanics_about_sliding
+from .multiple_shooting import AT_SECTION, Mode, PhaseImages, Phases, images_of_phases, inside
 from .pseudo_arclength import ComputedCycle, Curve, assembled
 
 NAMES = {
@@ -34,13 +39,20 @@ def where(mode: Mode, contact: int) -> str:
 
 
 class GuardMinimum(NamedTuple):
-    """A minimum of a guard inside a phase; or a guard at the start of a phase, where it decides which mode follows."""
+    """A minimum of a guard inside a phase; or a guard at the start of a phase, where it decides which mode follows, or at its
+    end, where another contact's event changes it.
+    """
 
     phase: int
-    guard: int
+    mode: Mode  # that of the phase, or one that it could have begun with, ending at the guard
     time: float  # s after the phase's start
     value: float  # relative to the guard's largest value
-    bend: float  # the guard's second derivative in time; zero at the start of a phase, where the instant is fixed
+    bend: float  # the guard's second derivative in time; zero at the start and the end, where the instant is fixed
+    at_end: bool = False
+
+    @property
+    def guard(self) -> int:
+        return self.mode.ending
 
 
 class Grazing(NamedTuple):
@@ -52,10 +64,10 @@ class Grazing(NamedTuple):
 
 
 def guard_minima(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
-    """All minima of guards inside the phases of a cycle, the lowest first."""
+    """All minima of guards in the phases of a cycle, the lowest first."""
     family, phases = curve.family, cycle.phases
     looked = inside(family.at(cycle.parameter), family.stepper, phases)
-    found = []
+    found = _static_edges(curve, cycle)
     for k, mode in enumerate(phases.modes):
         step = phases.h[k] / (looked.guards.shape[1] - 1)
         for j in range(looked.guards.shape[2]):
@@ -64,8 +76,11 @@ def guard_minima(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
             # Both guards of a detached contact are its gap.
             if not size > 0 or step == 0 or (status == Status.DETACH and which == 1):
                 continue
+            own = mode._replace(ending=j)
             if status == Status.STICK or (status == Status.SLIDE and which == 0):
-                found.append(GuardMinimum(k, j, 0.0, float(guard[0] / size), 0.0))
+                found.append(GuardMinimum(k, own, 0.0, float(guard[0] / size), 0.0))
+            if mode.ending != AT_SECTION and mode.ending // 2 != j // 2:
+                found.append(GuardMinimum(k, own, float(phases.h[k]), float(guard[-1] / size), 0.0, at_end=True))
             inner = guard[1:-1]
             for i in np.flatnonzero((inner <= guard[:-2]) & (inner <= guard[2:])) + 1:
                 bend = float(guard[i - 1] - 2 * guard[i] + guard[i + 1]) / step**2
@@ -74,8 +89,46 @@ def guard_minima(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
                 value = guard[i] + 0.5 * slope * shift
                 if bend <= 0:
                     continue
-                found.append(GuardMinimum(k, j, float(i * step + shift), float(value / size), float(bend)))
+                found.append(GuardMinimum(k, own, float(i * step + shift), float(value / size), float(bend)))
     return sorted(found, key=lambda minimum: minimum.value)
+
+
+@by_numpy
+def _belts_that_may_hold(scene: Scene):
+    """Belt speeds of the contacts, NaN where static friction is no larger than that of sliding."""
+    mechanics = mechanics_about_sliding(scene)
+    belts = mechanics.belt_speed
+    return jnp.where(mechanics.friction.static > mechanics.friction(jnp.zeros_like(belts)), belts, jnp.nan)
+
+
+def _static_edges(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
+    """Where a contact slides on though its slip has ended, by itself or by an impact: the edges of the cone of static friction,
+    if that is larger.
+    """
+    family, phases = curve.family, cycle.phases
+    scene = family.at(cycle.parameter)
+    belts, tangential = (
+        np.atleast_1d(_belts_that_may_hold(scene)),
+        np.atleast_1d(contact_coordinates(scene.structure)[0]),
+    )
+    velocities = phases.y[:, scene.structure.size + tangential]
+    at_rest = np.abs(velocities - belts) <= 1e-9 * np.max(np.abs(velocities))
+    places, modes = [], []
+    for k, mode in enumerate(phases.modes):
+        before = phases.modes[k - 1]
+        contact = before.ending // 2
+        if before.ending == AT_SECTION or before.status[contact] == Status.STICK:
+            continue
+        if mode.status[contact] == Status.SLIDE and at_rest[k, contact]:
+            places += [k, k]
+            modes += [mode.sticking(contact)._replace(ending=2 * contact + which) for which in range(2)]
+    if not places:
+        return []
+    none = np.zeros(len(places))
+    margins = images_of_phases(scene, family.direction, family.stepper, modes, modes, phases.y[places], none).guard
+    width = np.repeat(np.abs(margins[::2] + margins[1::2]), 2)
+    shares = np.divide(margins, width, out=np.full_like(margins, np.inf), where=width > 0)
+    return [GuardMinimum(k, mode, 0.0, float(share), 0.0) for k, mode, share in zip(places, modes, shares, strict=True)]
 
 
 def images_up_to_minimum(
@@ -83,7 +136,7 @@ def images_up_to_minimum(
 ) -> tuple[PhaseImages, PhaseImages]:
     """Images of all phases, and of the phase with the minimum up to its instant."""
     family, k = curve.family, minimum.phase
-    partial = phases.modes[k]._replace(ending=minimum.guard)
+    partial, time = minimum.mode, phases.h[k] if minimum.at_end else minimum.time
     modes = (*phases.modes, partial)
     following = (*phases.modes[1:], phases.modes[0], partial)
     found = images_of_phases(
@@ -93,16 +146,20 @@ def images_up_to_minimum(
         modes,
         following,
         np.concatenate([phases.y, phases.y[k : k + 1]]),
-        np.append(phases.h, minimum.time),
+        np.append(phases.h, time),
     )
     return PhaseImages(*(part[:-1] for part in found)), PhaseImages(*(part[-1:] for part in found))
 
 
 def row_of(curve: Curve, phases: Phases, minimum: GuardMinimum, partial: PhaseImages) -> Float[np.ndarray, " m"]:
-    """The derivative of a guard's minimum by the unknowns; to first order, a change of its instant has no effect."""
+    """The derivative of a guard's minimum by the unknowns; inside a phase, a change of its instant has no effect to first
+    order.
+    """
     size = phases.y.shape[1]
     row = np.zeros(len(curve.scales))
     row[minimum.phase * size : (minimum.phase + 1) * size] = partial.guard_y[0]
+    if minimum.at_end:
+        row[phases.y.size + minimum.phase] = partial.guard_h[0]
     row[-1] = partial.guard_parameter[0]
     return row * curve.scales
 

@@ -1,5 +1,8 @@
 """Where the contact modes of a branch of cycles change: the special point there, and the cycles with other modes beyond it."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
@@ -14,55 +17,83 @@ from .verification import on_section, real_motion
 MOST_PHASES = 256
 
 
+class _Bracket(NamedTuple):
+    """Two distances along the tangent at a point of a branch between which the modes change, with the computed cycles there."""
+
+    family: Family
+    here: BranchPoint
+    tangent: Float[np.ndarray, " m"]
+    step: float  # in which the change was found
+    low: float
+    high: float
+    valid: ComputedCycle  # at the lower distance, a real motion
+    ahead: ComputedCycle | None  # at the higher one, where the equations have a solution beyond the change
+
+    def halved(self, times: int) -> "_Bracket":
+        """A narrower one."""
+        _, here, tangent, _, low, high, valid, ahead = self
+        for _ in range(times):
+            middle = 0.5 * (low + high)
+            cycle = here.curve.along(here.cycle, tangent, middle)
+            if cycle is None:
+                high = middle
+            elif is_real_motion(self.family, cycle):
+                low, valid = middle, cycle
+            else:
+                high, ahead = middle, cycle
+        return self._replace(low=low, high=high, valid=valid, ahead=ahead)
+
+    def root(self, test: Callable[[ComputedCycle], float]) -> ComputedCycle | None:
+        """The cycle between the two on which a function is zero; None unless it has other signs on them."""
+        here = self.here
+        return root(lambda s: here.curve.along(here.cycle, self.tangent, s), test, self.low, self.high)[1]
+
+    def last_real(self) -> ComputedCycle:
+        """The last real motion, to rounding: for a change that is not known to be where some function is zero."""
+        return self.halved(30).valid
+
+
 def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray, " m"], step: float):
     """The change of modes within a step: the special point, and the point, tangent and step with which to go on, if any."""
-    # Halvings that bracket a change of modes before it is computed.
-    halvings = 14
     curve = here.curve
-    low, high, ahead = 0.0, step, curve.along(here.cycle, tangent, step)
-    valid = here.cycle
-    for _ in range(halvings):
-        middle = 0.5 * (low + high)
-        cycle = curve.along(here.cycle, tangent, middle)
-        if cycle is None:
-            high = middle
-            continue
-        if is_real_motion(family, cycle):
-            low, valid = middle, cycle
-        else:
-            high, ahead = middle, cycle
+    whole = _Bracket(family, here, tangent, step, 0.0, step, here.cycle, curve.along(here.cycle, tangent, step))
+    bracket = whole.halved(14)
+    valid, ahead = bracket.valid, bracket.ahead
     if ahead is None:
         return None
     # Events of two contacts that move alike are always at once.
     gone = [k for k in valid.phases.lasting() if ahead.phases.h[k] <= 0 and not here.cycle.phases.is_at_once(k)]
     if gone:
-        return _reordered(family, curve, valid, gone[0]) or _removed(family, curve, valid, tangent, gone[0], step)
-    if turned_back := _missed(curve, here, tangent, low, high, ahead):
+        return _reordered(family, curve, valid, gone[0]) or _removed(bracket, gone[0])
+    if turned_back := _missed(bracket, ahead):
         return turned_back, None
+    vanishes = _vanishing(valid.phases, here.cycle.phases)
     return (
-        _inserted(family, curve, valid, ahead, tangent, step)
-        or _removed(family, curve, valid, tangent, _shortest(valid.phases, here.cycle.phases), step)
+        _inserted(bracket, ahead)
+        or (None if vanishes is None else _removed(bracket, vanishes, seen=True))
         or _grazes(curve, valid, ahead)
+        or (None if vanishes is None else _removed(bracket, vanishes))
+        or (Special("contact modes change", curve, bracket.last_real()), None)
     )
 
 
-def _shortest(phases: Phases, before: Phases) -> int:
+def _vanishing(phases: Phases, before: Phases) -> int | None:
+    """The phase that has become shortest beside its length before, if it has shrunk by half."""
     lasting = phases.lasting()
-    return min([k for k in lasting if not before.is_at_once(k)] or lasting, key=lambda k: phases.h[k])
+    among = [k for k in lasting if not before.is_at_once(k)] or lasting
+    shares = np.abs(phases.h[among] / np.where(before.h[among] == 0, np.inf, before.h[among]))
+    return among[int(np.argmin(shares))] if np.min(shares) < 0.5 else None
 
 
-def _missed(curve: Curve, here: BranchPoint, tangent, low: float, high: float, ahead: ComputedCycle) -> Special | None:
+def _missed(bracket: _Bracket, ahead: ComputedCycle) -> Special | None:
     """The cycle on which a guard only just falls to zero at the end of a phase, between two distances along the tangent.
     Beyond, it rises there, so the event came before; and the parameter has turned back.
     """
+    curve = bracket.here.curve
     for k in risen_to_zero(ahead):
         if curve.modes[k].ending == AT_SECTION:
             continue
-
-        def rise(cycle: ComputedCycle, k=k) -> float:
-            return float(cycle.images.guard_h[k])
-
-        _, cycle = root(lambda s: curve.along(here.cycle, tangent, s), rise, low, high)
+        cycle = bracket.root(lambda cycle, k=k: float(cycle.images.guard_h[k]))
         if cycle is not None:
             mode = curve.modes[k]
             return Special(touch(mode, mode.ending), curve, cycle, turns=True)
@@ -77,8 +108,9 @@ def _grazes(curve: Curve, valid: ComputedCycle, ahead: ComputedCycle):
     return Special(name_of(grazing, None, removed=False), curve, grazing.cycle, grazing.row, grazing), None
 
 
-def _inserted(family: Family, curve: Curve, valid: ComputedCycle, ahead: ComputedCycle, tangent, step: float):
+def _inserted(bracket: _Bracket, ahead: ComputedCycle):
     """A change beyond which there are more phases."""
+    family, curve, tangent, step = bracket.family, bracket.here.curve, bracket.tangent, bracket.step
     # Distances beyond a change of modes at which the next modes are determined, as shares of the step.
     beyond = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
     for share in beyond:
@@ -94,13 +126,13 @@ def _inserted(family: Family, curve: Curve, valid: ComputedCycle, ahead: Compute
         if first is None or not is_real_motion(family, first):
             continue
         special, grazing = None, grazing_of(curve, ahead)
-        if grazing is not None and _between(grazing.cycle, valid, ahead):
+        if grazing is not None and _between(grazing.cycle, bracket.valid, ahead):
             name = name_of(grazing, change, removed=False)
             special = Special(name, curve, grazing.cycle, grazing.row, grazing)
         elif change is not None and not change.merges:
             special = vanishing(longer, first, change.phase)
         if special is None:
-            special = Special("", curve, valid)
+            special = Special("", curve, bracket.last_real())
         if not special.name:
             special = special._replace(name=name_of(None, change, removed=False))
         away = longer.tangent(first, None)
@@ -114,8 +146,11 @@ def _inserted(family: Family, curve: Curve, valid: ComputedCycle, ahead: Compute
     return None
 
 
-def _removed(family: Family, curve: Curve, valid: ComputedCycle, tangent, phase: int, step: float):
-    """A change beyond which there are fewer phases."""
+def _removed(bracket: _Bracket, phase: int, seen: bool = False):
+    """A change beyond which there are fewer phases; if it is to be `seen`, only where a guard touches zero or the phase
+    vanishes.
+    """
+    family, curve, valid = bracket.family, bracket.here.curve, bracket.valid
     shorter = _shorter(family, valid, phase)
     if shorter is None:
         return None
@@ -129,10 +164,14 @@ def _removed(family: Family, curve: Curve, valid: ComputedCycle, tangent, phase:
     if grazing is not None and _apart(grazing.cycle, first) < 2e-3:
         special = Special(name_of(grazing, change, removed=True), fewer, grazing.cycle, grazing.row, grazing)
         away = fewer.tangent(grazing.cycle, None)
-        away = away * np.sign(grazing.row @ away)
+        # Beyond the edge of static friction the contact slides on.
+        held = grazing.minimum.mode.status != fewer.modes[grazing.minimum.phase].status
+        away = away * np.sign(grazing.row @ away) * (-1.0 if held else 1.0)
     else:
         found = None if change.merges else vanishing(curve, valid, phase)
-        special = Special("", curve, valid) if found is None else found
+        if seen and (found is None or bracket.ahead is None or not _between(found.cycle, valid, bracket.ahead)):
+            return None
+        special = Special("", curve, bracket.last_real()) if found is None else found
         special = special._replace(name=name_of(None, change, removed=True))
         away = _outward(family, fewer, first, away, special.cycle)
     return special, _onward(family, fewer, special.cycle if special.curve is fewer else first, away)

@@ -63,6 +63,12 @@ class Mode(NamedTuple):
         status[contact], direction[contact] = other.mode_of(contact)
         return self._replace(status=tuple(status), direction=tuple(direction))
 
+    def sticking(self, contact: int) -> "Mode":
+        """The mode in which that contact sticks."""
+        status, direction = list(self.status), list(self.direction)
+        status[contact], direction[contact] = int(Status.STICK), 0.0
+        return self._replace(status=tuple(status), direction=tuple(direction))
+
     @property
     def lands(self) -> bool:
         """Whether a gap that closes ends the phase."""

@@ -198,7 +198,7 @@ def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> st
     what = "" if change is None else f"{change.word} {'removed' if removed else 'inserted'}{change.where}"
     if grazing is None:
         return what or "contact modes change"
-    mode = grazing.cycle.phases.modes[grazing.minimum.phase]
+    mode = grazing.minimum.mode
     how = touch(mode, grazing.minimum.guard)
     # A contact that is named once need not be named again.
     return f"{how}: {what.removesuffix(where(mode, grazing.minimum.guard // 2))}" if what else how

@@ -44,12 +44,16 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> RealMotion
 
 
 def amplitude(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotion) -> float:
-    """The peak tangential speed (m/s) of a cycle: of its real motion, unless rounding makes that touch again and again where
-    the cycle grazes, so that it comes to no end; then of the computed phases.
+    """The peak tangential speed (m/s) of a cycle: of its real motion; unless rounding makes that touch again and again where
+    the cycle grazes, so that it comes to no end, or go another way where that is about to change. Then of the computed phases.
     """
-    segments = real.seen.segments
-    if abs(np.sum(segments.h) - phases.period) <= 1e-9 * phases.period:
-        return float(real.seen.amplitude)
+    segments, seen = real.seen.segments, float(real.seen.amplitude)
+    computed = _highest_speed(scene, stepper, phases)
+    goes_round = abs(np.sum(segments.h) - phases.period) <= 1e-9 * phases.period
+    return seen if goes_round and abs(seen - computed) <= 1e-4 * seen else computed
+
+
+def _highest_speed(scene: Scene, stepper: EventExact, phases: Phases) -> float:
     tangential, _ = contact_coordinates(scene.structure)
     places = scene.structure.size + np.atleast_1d(tangential)
     # Looks at all phases, then finer ones about the highest speed.

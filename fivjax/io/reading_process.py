@@ -6,7 +6,6 @@ reads whatever other files a file names; that is refused. What was read goes out
 of JSON and the bytes of its array. Nothing is pickled.
 """
 
-import importlib
 import json
 import math
 import sys
@@ -263,8 +262,17 @@ def import_libraries(kind: str) -> None:
         package = types.ModuleType("pyyeti.nastran")
         package.__path__ = [f"{folder}/nastran" for folder in found.submodule_search_locations or ()]
         sys.modules["pyyeti.nastran"] = package
-    for name in LIBRARIES[kind]:
-        importlib.import_module(name)
+    if kind == "netcdf":
+        import h5netcdf  # noqa: F401
+    elif kind == "matlab73":
+        import h5py  # noqa: F401
+    elif kind == "matlab":
+        import scipy.io
+    else:
+        import numpy  # noqa: F401
+        import pyyeti.nastran.op4  # noqa: F401
+    if kind in ("matlab", "output4"):
+        import scipy.sparse  # noqa: F401
 
 
 if __name__ == "__main__":

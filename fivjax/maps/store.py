@@ -53,7 +53,7 @@ class Store:
 
     **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a folder that is no store, the store
     of another run (naming the first difference), one whose metadata are damaged, and one that another process is writing;
-    `ImportError` without Zarr.
+    `ImportError` without Zarr; `OSError` for a disk that is full or read-only, naming the store.
     """
 
     def __init__(self, path: str | Path, run: dict, grid: Grid, tile: tuple[int, ...], energy: bool):
@@ -62,9 +62,11 @@ class Store:
         self.energy, self.run = energy, {**run, "chunk": list(tile)}
         fields = by_name(not_run(1, energy))
         if not self.path.exists():
-            create(self.path, self.run, grid, tile, fields)
+            with _naming(self.path):
+                create(self.path, self.run, grid, tile, fields)
         check_begun(self.path, self.run, grid, tile, fields)
-        self._lock = lock(self.path)
+        with _naming(self.path):
+            self._lock = lock(self.path)
         try:
             # A chunk without a file is one that was not written, or is lost.
             with zarr().config.set({"array.write_empty_chunks": True}):
@@ -123,6 +125,10 @@ class Store:
 
     def keep(self, places: Indices, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
         """Keep the results of the job with these trajectories."""
+        with _naming(self.path):
+            self._keep(places, verdicts, found)
+
+    def _keep(self, places: Indices, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
         if found is not None:
             folder = self.path / FOUND
             folder.mkdir(exist_ok=True)
@@ -156,6 +162,19 @@ class Store:
         with contextlib.suppress(OSError):  # jobs are under way, or there never were any
             (self.path / JOBS).rmdir()
         self._lock.close()
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors of the operating system name the store, and say what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(
+            error.errno,
+            f"Store `{path}` cannot be written: {error.strerror}. What it holds is whole. Make room, or the disk writable, and "
+            f"call again; or give another path",
+        ) from error
 
 
 def _sync(path: Path) -> None:

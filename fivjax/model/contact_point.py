@@ -98,7 +98,7 @@ def resolve_contacts(contacts, names: tuple[str, ...]) -> tuple[ContactPoint, ..
         return found
     columns = np.concatenate(directions(found, n), axis=1)
     if np.linalg.matrix_rank(columns / np.linalg.norm(columns, axis=0)) < columns.shape[1]:
-        if len(found) == 1 and isinstance(found[0].tangential, int) and found[0].tangential == found[0].normal:
+        if len(found) == 1 and all(isinstance(direction, int) for direction in chosen):
             raise ValueError(
                 f"Arguments `tangential` and `normal` must name two different coordinates, but both are {found[0].normal}."
             )

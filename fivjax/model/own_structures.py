@@ -3,12 +3,28 @@
 from collections.abc import Callable, Hashable
 from typing import Any
 
+# Arguments of functions that take parameters by their names beside these: maps, critical kicks, charts and curves of modes.
+ARGUMENTS = frozenset(
+    {
+        *("self", "scene", "system", "direction", "method", "t_max", "memory", "max_steps", "progress", "resume"),
+        *("energy", "refine", "sparse", "audit", "executor", "kick", "p_range", "p_step", "tolerance", "derivatives"),
+    }
+)
 # A function of a structure's parameters by name.
 Maker = Callable[..., Any]
 
 # The most functions that are remembered, the newest: a notebook may define one again and again.
 MOST = 64
 _MADE: dict[Hashable, tuple[Callable, Maker]] = {}
+
+
+def check_name(name: str) -> None:
+    """**Raises:** `ValueError` for what no parameter may be called."""
+    if name in ARGUMENTS:
+        raise ValueError(
+            f"Argument `parameters` must not name one `{name}`: that is an argument of functions that take parameters by their "
+            f"names, such as `bistability_map`. Give it another name."
+        )
 
 
 def remember(function: Callable, settings: Hashable, maker: Maker) -> None:

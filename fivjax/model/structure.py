@@ -22,7 +22,7 @@ from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision, is_known, real, state_for_pickle, state_from_pickle
 from .contact_point import ContactPoint, directions, resolve_contacts
 from .matrix_checks import check_matrix, check_names, check_shapes
-from .own_structures import remember
+from .own_structures import check_name, remember
 from .printing import as_call
 
 
@@ -219,10 +219,7 @@ class Structure(eqx.Module):
         if not parameters:
             raise ValueError("Argument `parameters` must hold at least one. Give matrices without any to `Structure`.")
         for name, value in parameters.items():
-            if name in ("self", "scene"):
-                raise ValueError(
-                    f"Argument `parameters` must not name one `{name}`, which functions of fivjax take first."
-                )
+            check_name(name)
             arguments.real_number(name, value)
         numbers = {name: real(value) for name, value in parameters.items()}
         dampers = arguments.listed_names("dampers", dampers, "c1")

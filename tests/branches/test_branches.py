@@ -1,5 +1,7 @@
 """Branches of limit cycles against closed forms, against ODE solvers of another kind, and against trajectories."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -333,7 +335,10 @@ def test_a_branch_ends_where_its_event_would_be_missed():
 def test_a_branch_with_ever_shorter_impacts_ends():
     """Beyond a change of modes the motion had 16,384 phases, and their equations would have been a matrix of 98 GiB."""
     branch = fj.continue_cycle(with_static_friction(1.0), "mu_static", (0.21, 0.6))
-    assert branch.ends == "At mu_static = 0.55396671036 stick removed: no cycle was found to go on beyond."
+    assert branch.ends == "At mu_static = 0.553966957127 edge of the friction cone: no cycle was found to go on beyond."
+    end = branch.isel(point=-1)
+    share = _share_that_holds_a_reversal(float(with_static_friction(1.0).parameters["mu"]), end)
+    assert share == pytest.approx(0.553966957127, rel=1e-9)
 
 
 def rebounding(restitution: float) -> fj.Scene:
@@ -494,6 +499,50 @@ def test_a_change_of_modes_lies_between_its_neighbours():
     assert list(special[places])[-2:] == ["edge of the friction cone: slip removed", "slip inserted"]
     np.testing.assert_allclose(theta[places][-2:], [0.154307275894, 0.159207603727], rtol=1e-10)
     assert np.all(np.diff(theta[places[-2] - 1 :]) > 0)
+
+
+def _share_that_holds_a_reversal(mu: float, end) -> float:
+    """|T|/N of the forces that would keep the contact from moving where the slip of a cycle reverses, by the independent solver,
+    at a point of a branch over static friction: with a little less of it.
+    """
+    start = np.split(end.state.values, 2)
+    model = oracle.paper_model(mu_dynamic=mu, mu_static=float(end.parameter) - 1e-6, belt_speed=1.0)
+    run = oracle.simulate(model, float(end.period), y0=start)
+    (reversal,) = [time for time, *modes in run.events if modes == [oracle.SLIDE, oracle.SLIDE]]
+    at = oracle.simulate(model, reversal, [reversal], y0=start)
+    forces = np.eye(3)[:, [model.tangential, model.normal]]
+    moves = [k for k in range(3) if k not in (model.tangential, model.normal)]
+    rest = model.load_direction * model.load(0.0) - model.damping @ at.v[-1] - model.stiffness @ at.q[-1]
+    found = np.linalg.solve(np.column_stack([model.mass[:, moves], -forces]), rest)
+    return float(abs(found[-2] / found[-1]))
+
+
+def edge_of_static_friction(scene):
+    """A branch over static friction, and its special point."""
+    branch = fj.continue_cycle(scene, "mu_static", (0.59, 0.6), derivatives=True)
+    return branch, branch.isel(point=int(np.argmax(branch["special"].values != "")))
+
+
+HELD = dataclasses.replace(paper(1.0, 0.22), friction=fj.Coulomb(0.22, 0.59))
+
+
+def test_a_branch_ends_where_larger_static_friction_begins_to_hold_a_reversal_of_slip():
+    """The force that would hold it there is that of static friction: beyond, it sticks for milliseconds at once."""
+    branch, end = edge_of_static_friction(HELD)
+    assert str(end.special.values) == "edge of the friction cone"
+    assert branch.attrs["ends"].endswith("no cycle was found to go on beyond.")
+    # What rounding makes of the motion has no part in its peak.
+    assert float(end.amplitude) == pytest.approx(float(branch.amplitude[-2]), rel=1e-3)
+    assert _share_that_holds_a_reversal(0.22, end) == pytest.approx(float(end.parameter), rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "by"), [("mu", 1e-4), ("k1", 20.0), ("belt_speed", 1e-3)])
+def test_the_edge_of_static_friction_moves_as_differences_say(name, by):
+    value = float(HELD.parameters[name])
+    low, at, high = (edge_of_static_friction(HELD.replace(**{name: value + side * by}))[1] for side in (-1, 0, 1))
+    difference = float(high.parameter - low.parameter) / (2 * by)
+    assert float(at.d_special.sel(of=name)) == pytest.approx(difference, rel=1e-4)
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Maps kept in a folder of chunks: whole at any instant, resumed job by job, and of one run only."""
 
+import errno
 import json
 
 import numpy as np
@@ -13,7 +14,7 @@ from fivjax.attractors.cycles import StableCycle
 from fivjax.attractors.neighbourhood import Neighbourhood
 from fivjax.attractors.tori import Torus
 from fivjax.attractors.tube import Tube
-from fivjax.maps import engine, plan
+from fivjax.maps import engine, plan, store
 from fivjax.maps.job_files import attractors_from_bytes, attractors_to_bytes
 from tests.helpers import stand_in_jobs
 
@@ -120,6 +121,27 @@ def test_a_second_writer_is_refused(paper_scene, tmp_path, jobs_run, monkeypatch
 
     monkeypatch.setattr(engine, "run_job", second)
     fj.bistability_map(paper_scene, resume=path, progress=False, **AXES)
+
+
+def test_a_full_disk_is_said_of_the_store_and_what_it_holds_stays(paper_scene, tmp_path, jobs_run, monkeypatch):
+    """The system's error names neither the store nor what to do."""
+    (run, _), path, full = jobs_run, tmp_path / "map.zarr", []
+    sync = store._sync
+
+    def sync_until_full(chunk):
+        if len(run) == 3:
+            full.append(chunk)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(chunk)
+
+    monkeypatch.setattr(store, "_sync", sync_until_full)
+    with pytest.raises(OSError, match=rf"Store `{path}` cannot be written: No space left on device. .* Make room"):
+        fj.bistability_map(paper_scene, resume=path, progress=False, **AXES)
+    monkeypatch.setattr(store, "_sync", sync)
+    run.clear()
+    again = fj.bistability_map(paper_scene, resume=path, progress=False, **AXES)
+    np.testing.assert_array_equal(again["verdict"], expected()[0])
+    assert full and len(run) == 2  # of three jobs
 
 
 def test_a_refined_map_is_kept_level_by_level(paper_scene, tmp_path, jobs_run):

@@ -3,6 +3,7 @@
 No test here may reach an engine: the fixture below makes that an error of its own kind.
 """
 
+import inspect
 import math
 import re
 import sys
@@ -19,6 +20,7 @@ from fivjax import cli
 from fivjax.foundation import arguments, digits
 from fivjax.io import files
 from fivjax.linear.design import lower_growth_rate
+from fivjax.model.own_structures import ARGUMENTS
 from tests.helpers.refusing import EngineReached, refused, refused_on_the_command_line, untouched, without_engines
 
 
@@ -415,6 +417,23 @@ def test_what_no_structure_is_made_of(given):
         fj.Structure.from_parameters(lambda k: None, given)
     with refused(ValueError, "`parameters`", "at least one"):
         fj.Structure.from_parameters(lambda: None, {})
+    for name in ARGUMENTS:
+        with refused(ValueError, "`parameters`", f"`{name}`", "another name"):
+            fj.Structure.from_parameters(lambda **_: None, {name: 1.0})
+
+
+@pytest.mark.parametrize("normal", [np.array([2.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 0])
+def test_a_contact_of_one_direction(normal):
+    with refused(ValueError, "independent" if np.ndim(normal) and normal[0] > 1 else "two different coordinates"):
+        fj.Structure(*[np.eye(3)] * 3, np.eye(3)[0], contacts=[fj.ContactPoint(0, normal)])
+
+
+def test_no_parameter_is_called_like_an_argument_of_what_takes_parameters_by_their_names():
+    """It would be taken for that argument."""
+    functions = fj.bistability_map, fj.basins, fj.critical_perturbation, fj.cea.chart, fj.cea.modes
+    kinds = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+    taken = {name for one in functions for name, at in inspect.signature(one).parameters.items() if at.kind in kinds}
+    assert taken | {"self"} == ARGUMENTS
 
 
 @pytest.mark.parametrize("given", [None, 1.0, [1, 2], {}])
