@@ -108,6 +108,8 @@ def calibrate(
         None if recording.regime == "limit cycle" else _blocks(scene, recording, k, rate, len(parameters.names))
         for k, recording in enumerate(recordings)
     ]
+    for k, recording in enumerate(recordings):
+        _check_samples(recording, k)
     cycles = all(r.regime == "limit cycle" for r in recordings)
     misfits = tuple(
         misfit_of_cycle(r, method, scene) if b is None else misfit_of_waveform(r, b, method, scene)
@@ -185,3 +187,14 @@ def _check_recording(scene: Scene, recording: Recording, k: int) -> None:
         start_state(own, recording.y0)
     elif not starts_unknown(own, recording):
         sliding_equilibrium(own)
+
+
+def _check_samples(recording: Recording, k: int) -> None:
+    varies = np.ptp(recording.values, axis=0) > 0
+    if not np.any(varies):
+        raise ValueError(f"Recording {k} is the same at every sample, so it tells nothing. Was the sensor connected?")
+    largest = np.max(np.abs(recording.values), axis=0)
+    for channel, value in zip(recording.channels, largest, strict=True):
+        # Squares of what is beyond these are no longer numbers.
+        if value and not 1e-100 < value < 1e100:
+            raise ValueError(f"Recording {k} reaches {value:g} in channel `{channel}`, in SI units. Check its unit.")

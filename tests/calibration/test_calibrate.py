@@ -384,6 +384,7 @@ def test_command_line(tmp_path, decay, capsys, monkeypatch):
 
 
 QUIET = np.zeros((400, 1)) + 1e-3
+RISING = np.linspace(0.0, 1.0, 400)
 
 
 @pytest.mark.slow
@@ -419,11 +420,14 @@ def test_other_guesses_do_not_lead_an_aliased_recording_away_from_the_scene():
         (dict(data=fj.Recording(25e3, {"a0": QUIET[:, 0]}, mu=0.2)), ["`mu`", "known"]),
         (dict(data=fj.Recording(25e3, {"a0": QUIET[:, 0]}, wear=0.2)), ["`wear`", "belt_speed"]),
         (dict(data=fj.Recording(25e3, {"a0": QUIET[:60, 0]})), ["too short"]),
+        (dict(data=fj.Recording(25e3, {"a0": QUIET[:, 0], "v1": QUIET[:, 0]})), ["0", "same at every sample"]),
+        (dict(data=fj.Recording(25e3, {"a0": 1e200 * RISING})), ["acceleration 0", "1e+200", "unit"]),
+        (dict(data=fj.Recording(25e3, {"v1": 1e-200 * RISING})), ["velocity 1", "1e-200", "unit"]),
     ],
 )
 def test_refusals(options, fragments):
     """Refused at once, by name."""
-    given = {"scene": paper(), "data": fj.Recording(25e3, {"a0": QUIET[:, 0]}), "free": ["mu"], **options}
+    given = {"scene": paper(), "data": fj.Recording(25e3, {"a0": RISING}), "free": ["mu"], **options}
     with pytest.raises((ValueError, TypeError)) as refusal:
         fj.calibrate(**given)
     for fragment in fragments:
