@@ -1,9 +1,10 @@
 """The paper's oscillator: two masses on a moving belt, as a structure with seven parameters."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from ..foundation import arguments
-from ..foundation.precision import in_double_precision
+from ..foundation.precision import in_double_precision, is_known
 from .structure import Matrices, Structure
 
 
@@ -18,7 +19,8 @@ def belt_oscillator(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3, theta
     **Arguments:** masses `m1`, `m2` in kg; dampers `c1`, `c2` in N·s/m; springs `k1`, `k2` in N/m; belt inclination
     `theta` in rad.
 
-    **Raises:** `ValueError` for masses that are not positive, negative dampers or springs, or a non-finite value.
+    **Raises:** `ValueError` for masses that are not positive, negative dampers or springs, an angle beyond π, or a value that is
+    not finite.
 
     **Example:**
 
@@ -31,6 +33,11 @@ def belt_oscillator(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3, theta
     for name, value in {"c1": c1, "c2": c2, "k1": k1, "k2": k2}.items():
         arguments.real_number(name, value, minimum=0)
     arguments.real_number("theta", theta)
+    if is_known(theta) and abs(float(theta)) > np.pi:
+        raise ValueError(
+            f"Argument `theta` must be an angle in rad, between -π and π, but is {float(theta):g}. Give degrees as "
+            f"`np.radians({float(theta):g})`."
+        )
     return Structure.from_parameters(
         _matrices,
         {"m1": m1, "m2": m2, "c1": c1, "c2": c2, "k1": k1, "k2": k2, "theta": theta},

@@ -422,6 +422,16 @@ def test_what_no_structure_is_made_of(given):
             fj.Structure.from_parameters(lambda **_: None, {name: 1.0})
 
 
+def test_an_inclination_in_degrees(constant_scene):
+    for call in (
+        lambda: fj.belt_oscillator(theta=10),
+        lambda: constant_scene.replace(theta=-10.0),
+        lambda: fj.bistability_map(constant_scene, theta=[0.0, 10.0]),
+    ):
+        with refused(ValueError, "`theta`", "in rad", "np.radians("):
+            call()
+
+
 @pytest.mark.parametrize("normal", [np.array([2.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 0])
 def test_a_contact_of_one_direction(normal):
     with refused(ValueError, "independent" if np.ndim(normal) and normal[0] > 1 else "two different coordinates"):
