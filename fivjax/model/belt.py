@@ -19,8 +19,8 @@ def belt_oscillator(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3, theta
     **Arguments:** masses `m1`, `m2` in kg; dampers `c1`, `c2` in N·s/m; springs `k1`, `k2` in N/m; belt inclination
     `theta` in rad.
 
-    **Raises:** `ValueError` for masses that are not positive, negative dampers or springs, an angle beyond π, or a value that is
-    not finite.
+    **Raises:** `ValueError` for masses that are not positive, negative dampers or springs, an angle beyond π, or a value that
+    is not finite.
 
     **Example:**
 
