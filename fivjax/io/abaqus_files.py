@@ -76,7 +76,8 @@ def _matrix_input(path: Path, text: str) -> FileMatrix:
 
 def _with_directions(labels: np.ndarray) -> np.ndarray:
     """Pairs of node and direction; what is only numbered has direction 0."""
-    found = labels.astype(np.int64)
+    with np.errstate(invalid="ignore"):  # what is no node is refused next
+        found = labels.astype(np.int64)
     return found if found.shape[1] == 2 else np.hstack([found, np.zeros_like(found)])
 
 

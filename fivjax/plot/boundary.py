@@ -1,15 +1,13 @@
 """The boundary between sliding and squeal in a plane of the Poincaré section."""
 
-import numpy as np
 import xarray as xr
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..verdicts.verdict import Verdict
 from .maps import SLIDING_SHADE
-from .style import BLACK, BLUE, ORANGE, VERMILION, cell_edges, check_dataset, new_figure
+from .style import BLACK, BLUE, ORANGE, VERMILION, cell_edges, check_dataset, fill_cells, new_figure
 
 
 def boundary_section(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
@@ -25,19 +23,15 @@ def boundary_section(dataset: xr.Dataset, *, figure: Figure | None = None) -> Fi
     check_dataset(dataset, ("verdict", "manifold", "path"), "fj.boundary_section(scene)")
     figure = new_figure(figure, 7.2, 5.4)
     axes = figure.add_subplot()
-    x, y = cell_edges(dataset["unstable"].values), cell_edges(dataset["stable"].values)
+    x, y = edges = [cell_edges(dataset[name].values) for name in ("unstable", "stable")]
     verdict = dataset["verdict"].values
     handles: list[Patch | Line2D] = []
-    fills = (
+    for where, colour, label in (
         (verdict == Verdict.SLIDING, SLIDING_SHADE, "slides"),
         (verdict == Verdict.LIMIT_CYCLE, ORANGE, "squeals"),
         (verdict < 0, "0.6", "no verdict"),
-    )
-    for where, colour, label in fills:
-        if where.any():
-            shown = np.ma.masked_where(~where, np.ones(verdict.shape))
-            axes.pcolormesh(x, y, shown, cmap=ListedColormap([colour]), alpha=0.6, rasterized=True)
-            handles.append(Patch(facecolor=colour, edgecolor="0.6", alpha=0.6, label=label))
+    ):
+        handles += fill_cells(axes, edges, where, colour, label, 0.6)
     axes.plot(dataset["manifold"], dataset["stable"], color=BLACK, lw=1.6)
     handles.append(Line2D([], [], color=BLACK, lw=1.6, label="stable manifold"))
     for side, colour, marker in (("slides", BLUE, "v"), ("squeals", VERMILION, "^")):

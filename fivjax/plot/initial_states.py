@@ -1,8 +1,6 @@
 """Basins of attraction: which attractor each initial state leads to."""
 
-import numpy as np
 import xarray as xr
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -10,7 +8,20 @@ from matplotlib.patches import Patch
 from ..cycles.cycle import LimitCycle
 from ..verdicts.verdict import Verdict
 from .maps import SLIDING_SHADE
-from .style import BLACK, VERMILION, cell_edges, check_dataset, new_figure, with_unit
+from .style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    cell_edges,
+    check_dataset,
+    fill_cells,
+    new_figure,
+    variable_label,
+)
 
 
 def basins(dataset: xr.Dataset, *, saddle: LimitCycle | None = None, figure: Figure | None = None) -> Figure:
@@ -29,37 +40,31 @@ def basins(dataset: xr.Dataset, *, saddle: LimitCycle | None = None, figure: Fig
         )
     figure = new_figure(figure, 7.2, 4.8)
     axes = figure.add_subplot()
-    x, y = (cell_edges(dataset[name].values) for name in names)
+    edges = [cell_edges(dataset[name].values) for name in names]
     verdict, attractor = dataset["verdict"].values.T, dataset["attractor"].values.T
-
-    def fill(where: np.ndarray, colour: str, label: str) -> None:
-        if where.any():
-            shown = np.ma.masked_where(~where, np.ones_like(verdict, float))
-            axes.pcolormesh(x, y, shown, cmap=ListedColormap([colour]), rasterized=True)
-            handles.append(Patch(facecolor=colour, edgecolor="0.6", label=label))
-
     handles: list[Patch | Line2D] = []
     share = 100 * float(dataset["sliding_share"])
-    fill(verdict == Verdict.SLIDING, SLIDING_SHADE, f"slides: {share:.1f} %")
+    handles += fill_cells(axes, edges, verdict == Verdict.SLIDING, SLIDING_SHADE, f"slides: {share:.1f} %")
     # Colours of attractors, in the order of the table; readers who do not see red and green can distinguish them.
-    colours = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#F0E442")
+    colours = (BLUE, ORANGE, GREEN, PURPLE, SKY, "#F0E442")
     for place in range(dataset.sizes["attractors"]):
         one = dataset.isel(attractors=place)
         label = (
             f"{one['attractor_kind'].values!s}, {float(one['attractor_amplitude']):.4g} m/s: "
             f"{100 * float(one['share']):.1f} %"
         )
-        fill((verdict == Verdict.LIMIT_CYCLE) & (attractor == place), colours[place % len(colours)], label)
-    fill(verdict < 0, VERMILION, f"no verdict ({int((verdict < 0).sum())} of {verdict.size})")
+        there = (verdict == Verdict.LIMIT_CYCLE) & (attractor == place)
+        handles += fill_cells(axes, edges, there, colours[place % len(colours)], label)
+    handles += fill_cells(
+        axes, edges, verdict < 0, VERMILION, f"no verdict ({int((verdict < 0).sum())} of {verdict.size})"
+    )
     if saddle is not None and names[1] == f"d{names[0]}":
         path = saddle.trajectory(points=2000)
         k = saddle.scene.structure.coordinates.index(names[0])
         axes.plot(path.displacement[:, k], path.velocity[:, k], color=BLACK, lw=1.2)
         handles.append(Line2D([], [], color=BLACK, lw=1.2, label="saddle cycle"))
-    labels = [
-        with_unit(dataset[name].attrs.get("long_name", name), dataset[name].attrs.get("units", "1")) for name in names
-    ]
-    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), xlabel=labels[0], ylabel=labels[1])
+    labels = [variable_label(dataset[name]) for name in names]
+    axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xlabel=labels[0], ylabel=labels[1])
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     axes.set_title("Basins: where initial states lead")
     return figure

@@ -2,14 +2,13 @@
 
 import numpy as np
 import xarray as xr
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..foundation.quantities import QUANTITIES
 from ..verdicts.verdict import Verdict
-from .style import BLACK, VERMILION, axis_label, cell_edges, check_dataset, new_figure, with_unit
+from .style import BLACK, VERMILION, axis_label, cell_edges, check_dataset, fill_cells, new_figure, with_unit
 from .thresholds import draw_threshold
 
 SLIDING_SHADE = "#f2f2f2"
@@ -35,8 +34,7 @@ def bistability(
     axes = figure.add_subplot()
     x, y = (cell_edges(dataset[name].values) for name in names)
     verdict = dataset["verdict"].values.T
-    sliding = np.ma.masked_where(verdict != Verdict.SLIDING, np.ones_like(verdict, float))
-    axes.pcolormesh(x, y, sliding, cmap=ListedColormap([SLIDING_SHADE]), rasterized=True)
+    fill_cells(axes, (x, y), verdict == Verdict.SLIDING, SLIDING_SHADE, "")
     cycle = np.ma.masked_where(verdict != Verdict.LIMIT_CYCLE, dataset[value].values.T)
     mesh = axes.pcolormesh(x, y, cycle, cmap="viridis", rasterized=True)
     if cycle.count():
@@ -44,10 +42,7 @@ def bistability(
         figure.colorbar(mesh, ax=axes, label=with_unit(long_name, unit))
     open_ = verdict < 0
     handles = [Patch(facecolor=SLIDING_SHADE, edgecolor="0.6", label="returns to sliding")]
-    if open_.any():
-        marked = np.ma.masked_where(~open_, np.ones_like(verdict, float))
-        axes.pcolormesh(x, y, marked, cmap=ListedColormap([VERMILION]), rasterized=True)
-        handles.append(Patch(facecolor=VERMILION, label=f"no verdict ({int(open_.sum())} of {open_.size})"))
+    handles += fill_cells(axes, (x, y), open_, VERMILION, f"no verdict ({int(open_.sum())} of {open_.size})")
     boundary = dataset if critical is None else critical
     if names[1] == "p" and "p_crit" in boundary and boundary["p_crit"].dims == (names[0],):
         handles += draw_threshold(axes, boundary, names[0], BLACK)

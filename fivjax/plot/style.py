@@ -7,8 +7,10 @@ perceptually uniform colour maps; lines differ in style as well, so that everyon
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
+from matplotlib.patches import Patch
 
 from ..foundation import arguments
 from ..foundation.quantities import QUANTITIES
@@ -70,6 +72,17 @@ def cell_edges(values: np.ndarray) -> np.ndarray:
         return np.array([values[0] - half, values[0] + half])
     middle = 0.5 * (values[:-1] + values[1:])
     return np.concatenate([[2 * values[0] - middle[0]], middle, [2 * values[-1] - middle[-1]]])
+
+
+def fill_cells(axes: Axes, edges, where: np.ndarray, colour: str, label: str, alpha: float = 1.0) -> list[Patch]:
+    """Fill the cells between these `edges` (along x, along y) where something holds, and give their entry in a legend; none
+    where it holds nowhere.
+    """
+    if not where.any():
+        return []
+    shown = np.ma.masked_where(~where, np.ones(where.shape))
+    axes.pcolormesh(*edges, shown, cmap=ListedColormap([colour]), alpha=alpha, rasterized=True)
+    return [Patch(facecolor=colour, edgecolor="0.6", alpha=alpha, label=label)]
 
 
 def legend_above(axes: Axes, handles=None, columns: int = 3) -> Legend:
