@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 def show(result, **options) -> Figure:
     """The picture of a result.
 
-    **Arguments:** `result`, a `Trajectory`, a `LimitCycle` (one period), a map, a critical perturbation, modes, a stability
-    chart, energies per cycle, sensitivities, a `tradeoff` or a `Calibration`; `options` are those of the function of `fj.plot`
-    that draws it.
+    **Arguments:** `result`, a `Trajectory`, a `LimitCycle` (one period), a map, basins, a critical perturbation, modes, a
+    stability chart, energies per cycle, sensitivities, a `tradeoff` or a `Calibration`; `options` are those of the function of
+    `fj.plot` that draws it.
 
     **Returns:** a matplotlib figure.
 
@@ -63,6 +63,7 @@ def show(result, **options) -> Figure:
 # The function that draws a dataset, by the variables that it has.
 _PICTURES = (
     (lambda d: "manifold" in d and "path" in d, plot.boundary_section),
+    (lambda d: "verdict" in d and "share" in d, plot.basins),
     (lambda d: "verdict" in d, plot.bistability),
     (lambda d: "special" in d and "word" in d, plot.branch),
     (lambda d: "crossings" in d and d["p_crit"].ndim == 1 and d["p_crit"].size > 1, plot.critical),

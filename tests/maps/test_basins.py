@@ -51,6 +51,7 @@ def test_shares_are_counted_with_their_interval(found):
 
 def test_basins_are_drawn(found):
     figure = fj.plot.basins(found)
+    assert fj.show(found).axes[0].get_title() == figure.axes[0].get_title()
     assert "slides" in figure.axes[0].get_legend().get_texts()[0].get_text()
 
 
