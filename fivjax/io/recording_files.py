@@ -199,7 +199,8 @@ def _wav(path: Path):
         raise unreadable(path, "WAV", "it declares 0 tracks") from None
     except Exception as error:  # what the library raises for damaged files, of many kinds
         raise unreadable(path, "WAV", error) from None
-    scaled = np.asarray(samples, float)
+    with np.errstate(invalid="ignore"):  # what is no number is refused with its place
+        scaled = np.asarray(samples, float)
     if samples.dtype.kind == "u":  # it rests at 128
         scaled = (scaled - 128.0) / 128.0
     elif samples.dtype.kind == "i":
