@@ -3,6 +3,7 @@
 import enum
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 
@@ -28,6 +29,11 @@ class Contact(eqx.Module):
 
     status: Int[Array, "*batch"]
     direction: Float[Array, "*batch"]
+
+    @classmethod
+    def sliding(cls, direction: Float[Array, "*batch"]) -> "Contact":
+        """All contacts slide."""
+        return cls(np.full(np.shape(direction), Status.SLIDE, np.int32), direction)
 
 
 def same_mode(status, direction, other_status, other_direction):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..contact import Contact, Status
+from ..contact import Contact
 from ..foundation.kept_programs import kept
 from ..kernels.functions import KernelFunction
 from ..linear.linearisation import LinearSliding, linear_sliding
@@ -282,8 +282,7 @@ def _at_end(args, _):
         after = follow(how.method, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
         return (after.y, after.contact), None
 
-    direction = jnp.sign(mechanics.belt_speed)
-    sliding = Contact(jnp.full(direction.shape, Status.SLIDE, jnp.int32), direction)
+    sliding = Contact.sliding(jnp.sign(mechanics.belt_speed))
     return jax.lax.scan(piece, (jnp.zeros(2 * n), sliding), factors)[0][0], ()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .. import contact as physics
-from ..contact import Contact, Status
+from ..contact import Contact
 from ..foundation.precision import known_to_numpy
 from ..kernels.functions import KernelFunction
 from ..model.load import Pulse
@@ -39,8 +39,8 @@ def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int)
     """Crossings after the kick of the scene's load, from steady sliding; as many as asked for, if there are so many."""
     each = np.shape(contact_coordinates(scene.structure)[0])
     direction = np.broadcast_to(np.sign(np.asarray(scene.belt_speed, float)), each)
-    contact = Contact(np.full(each, Status.SLIDE, np.int32), direction)
-    return _followed(scene, stepper, directions, Point(np.zeros(2 * scene.structure.size), contact), None, crossings)
+    start = Point(np.zeros(2 * scene.structure.size), Contact.sliding(direction))
+    return _followed(scene, stepper, directions, start, None, crossings)
 
 
 def returned(scene: Scene, stepper: EventExact, directions: Scene, point: Point, crossings: int) -> Crossings:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, ModeForces, Status
+from ..contact import Contact, Mechanics, ModeForces
 from ..foundation.linear_solve import solve
 from ..foundation.numpy_evaluation import by_numpy
 from ..model.friction import slope_of
@@ -114,7 +114,6 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     equilibrium = jnp.concatenate([q, jnp.zeros(n, q.dtype)])
     direction, speed = jnp.sign(mechanics.belt_speed), jnp.abs(mechanics.belt_speed)
     keep = sliding_states(n, mechanics.normal)
-    contact = Contact(jnp.full(direction.shape, Status.SLIDE, jnp.int32), direction)
     mu = law(speed)
     dragging = direction * mu
     mass, damping, stiffness = sliding_matrices(scene.structure, dragging)
@@ -123,7 +122,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
         free = sliding_coordinates(n, mechanics.normal)
         along = jnp.asarray(free[:, None] == mechanics.tangential, damping.dtype)
         damping = damping + (along * (normal_force * slopes)) @ along.T
-    mode = ModeForces(mechanics, contact, mu)
+    mode = ModeForces(mechanics, Contact.sliding(direction), mu)
 
     def pressing(z):
         y = equilibrium.at[keep].add(z)
