@@ -1,6 +1,7 @@
 """A limit cycle, its properties, and the quantities computed from it."""
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
@@ -19,6 +20,9 @@ from ..section.return_maps import ReturnMaps, Section
 from ..simulation.trajectory import Trajectory, simulate
 from ..steppers.event_exact import EventExact
 from .one_period import Phase, floquet_multipliers, follow_period, word
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # A multiplier counts as inside the unit circle if its size is below one by at least this.
 MARGIN = 1e-9
@@ -108,17 +112,60 @@ class LimitCycle(eqx.Module):
         end = periods * self.period
         return simulate(self.scene, t1=end, dt_save=end / points, y0=self.state, energy=energy)
 
-    def to_dataset(self):
+    @classmethod
+    def from_dataset(cls, dataset: "xr.Dataset") -> "LimitCycle":
+        """A cycle from its dataset, such as `fj.open("cycle.nc")`: as it was, without computing anything.
+
+        **Raises:** `ValueError` for a dataset without a scene in its attributes, or one that is not a whole cycle.
+        """
+        scene = Scene.from_dataset(dataset)
+        try:
+            attrs, (start, points) = dataset.attrs, (dataset.isel(t=0), dataset["section_point"].values)
+            word = zip(dataset["word_status"].values.tolist(), dataset["word_duration"].values.tolist(), strict=True)
+            phases = [
+                Phase(Status(one) if isinstance(one, int) else tuple(map(Status, one)), duration)
+                for one, duration in word
+            ]
+            optional = {
+                name: float(attrs[name]) for name in ("rotation_number", "reach", "contraction") if name in attrs
+            }
+            size = points.shape[1] // 2
+            return cls(
+                scene=scene,
+                kind=str(attrs["kind"]),
+                state=np.concatenate([start[name].values.reshape(size) for name in ("displacement", "velocity")]),
+                contact=Contact(dataset["section_status"].values, dataset["section_direction"].values),
+                word=tuple(phases),
+                stable=bool(attrs["stable"]),
+                crossings=int(attrs["crossings"]),
+                points=points,
+                return_jacobian=dataset["return_jacobian"].values.reshape(2 * size, 2 * size),
+                multipliers=_complex(dataset, "multiplier"),
+                harmonics=_complex(dataset, "harmonics"),
+                **{name: float(attrs[name]) for name in ("period", "amplitude", "residual")},
+                **optional,
+            )
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+            raise ValueError(
+                "Argument `dataset` must be a saved limit cycle, but some of it is missing or damaged. Save the cycle again: "
+                "`fj.save(cycle, ...)`."
+            ) from None
+
+    def to_dataset(self) -> "xr.Dataset":
         """One period with names, units and the scene it came from; with its multipliers and points of the section."""
         dataset = self.trajectory().to_dataset()
+        each = ("contact",) * np.ndim(self.contact.status)
+        optional = {name: getattr(self, name) for name in ("rotation_number", "reach", "contraction")}
         return dataset.assign(
             multiplier_real=("multiplier", self.multipliers.real),
             multiplier_imaginary=("multiplier", self.multipliers.imag),
+            harmonics_real=(("order", "coordinate"), self.harmonics.real),
+            harmonics_imaginary=(("order", "coordinate"), self.harmonics.imag),
             section_point=(("point", "state"), np.asarray(self.points)),
-            word_status=(
-                ("phase", "contact")[: 1 + np.ndim(self.contact.status)],
-                np.array([phase.status for phase in self.word], int),
-            ),
+            section_status=(each, np.asarray(self.contact.status)),
+            section_direction=(each, np.asarray(self.contact.direction)),
+            return_jacobian=(("state", "before"), np.asarray(self.return_jacobian)),
+            word_status=(("phase", *each), np.array([phase.status for phase in self.word], int)),
             word_duration=("phase", [phase.duration for phase in self.word]),
         ).assign_attrs(
             kind=self.kind,
@@ -127,6 +174,7 @@ class LimitCycle(eqx.Module):
             stable=int(self.stable),
             residual=self.residual,
             crossings=self.crossings,
+            **{name: value for name, value in optional.items() if value is not None},
         )
 
     @property
@@ -180,6 +228,10 @@ class LimitCycle(eqx.Module):
         )
 
     __repr__ = __str__
+
+
+def _complex(dataset: "xr.Dataset", name: str) -> np.ndarray:
+    return dataset[f"{name}_real"].values + 1j * dataset[f"{name}_imaginary"].values
 
 
 def _named(status: Status | tuple[Status, ...]) -> str:

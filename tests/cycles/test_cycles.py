@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -38,6 +39,20 @@ def cycle() -> fj.LimitCycle:
 @pytest.fixture(scope="module")
 def saddle(cycle) -> fj.LimitCycle:
     return fj.saddle_cycle(paper(1.0), cycle)
+
+
+def test_a_saved_cycle_comes_back_to_the_last_bit(cycle, saddle, tmp_path):
+    """Also one that is unstable, which no search would find again."""
+    for one in (cycle, saddle):
+        fj.save(one, tmp_path / "cycle.nc")
+        found = fj.LimitCycle.from_dataset(fj.open(tmp_path / "cycle.nc"))
+        assert (repr(found), found.word, repr(found.scene)) == (repr(one), one.word, repr(one.scene))
+        for own, other in zip(jax.tree.leaves(one), jax.tree.leaves(found), strict=True):
+            np.testing.assert_array_equal(own, other)
+    run = found.trajectory(64)
+    np.testing.assert_allclose(run.velocity[-1], run.velocity[0], atol=1e-10 * np.abs(run.velocity).max())
+    with pytest.raises(ValueError, match="must be a saved limit cycle"):
+        fj.LimitCycle.from_dataset(run.to_dataset())
 
 
 @pytest.mark.slow

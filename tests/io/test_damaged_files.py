@@ -123,7 +123,7 @@ def flip(path, byte):
     ],
 )
 def test_hostile_attributes(scene):
-    for kind in (fj.Scene, fj.Trajectory):
+    for kind in (fj.Scene, fj.Trajectory, fj.LimitCycle):
         with pytest.raises(ValueError, match=r"argument `dataset` is damaged|Argument `dataset` must carry a scene"):
             kind.from_dataset(xr.Dataset(attrs={"scene": scene}))
 
