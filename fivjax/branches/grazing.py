@@ -98,7 +98,8 @@ def _belts_that_may_hold(scene: Scene):
     """Belt speeds of the contacts, NaN where static friction is no larger than that of sliding."""
     mechanics = mechanics_about_sliding(scene)
     belts = mechanics.belt_speed
-    return jnp.where(mechanics.friction.static > mechanics.friction(jnp.zeros_like(belts)), belts, jnp.nan)
+    sliding = mechanics.friction(jnp.zeros_like(belts)) * (1 + 1e-12)  # what differs by rounding is the same
+    return jnp.where(mechanics.friction.static > sliding, belts, jnp.nan)
 
 
 def _static_edges(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
@@ -107,10 +108,8 @@ def _static_edges(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
     """
     family, phases = curve.family, cycle.phases
     scene = family.at(cycle.parameter)
-    belts, tangential = (
-        np.atleast_1d(_belts_that_may_hold(scene)),
-        np.atleast_1d(contact_coordinates(scene.structure)[0]),
-    )
+    belts = np.atleast_1d(_belts_that_may_hold(scene))
+    tangential = np.atleast_1d(contact_coordinates(scene.structure)[0])
     velocities = phases.y[:, scene.structure.size + tangential]
     at_rest = np.abs(velocities - belts) <= 1e-9 * np.max(np.abs(velocities))
     places, modes = [], []
