@@ -94,8 +94,7 @@ def is_real_motion(family: Family, cycle: ComputedCycle) -> bool:
 
 
 def _moves_as_computed(real: RealMotion | None, cycle: ComputedCycle) -> bool:
-    found = None if real is None else real.phases
-    return found is not None and found.has_the_modes_of(cycle.phases) and not risen_to_zero(cycle)
+    return real is not None and real.moves_as(cycle.phases) and not risen_to_zero(cycle)
 
 
 def risen_to_zero(cycle: ComputedCycle) -> list[int]:

@@ -93,7 +93,8 @@ def continue_cycle(
       points, for the parameter itself, and where the change of modes is not a simple one.
 
     The attributes `begins` and `ends` say in a sentence where each end is, and why. A closed curve is passed once. A branch of
-    cycles whose two halves become alike ends there, at the period doubling from which it comes.
+    cycles whose two halves become alike ends there, at the period doubling from which it comes. Where cycles cannot be followed
+    it goes on with the next one much like the last, if there is one; others that coexist there are not looked for.
 
     **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not contain the scene's value or that it
     cannot have, and for anything that `limit_cycle` refuses; `NoLimitCycle` if there is no periodic cycle to start from.

@@ -204,6 +204,9 @@ def _grazing_between(family: Family, last: BranchPoint, found: BranchPoint) -> B
     if changed is None or changed[0].grazing is None:
         return None
     special = changed[0]
+    # As seen from the start outwards.
+    swapped = {"inserted": "removed", "removed": "inserted"}
+    special = special._replace(name=" ".join(swapped.get(word, word) for word in special.name.split(" ")))
     within = (special.cycle.parameter - last.cycle.parameter) * (special.cycle.parameter - found.cycle.parameter) < 0
     return branch_point(family, special.curve, special.cycle, special) if within else None
 

@@ -12,7 +12,7 @@ from ..model.sliding import contact_coordinates
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 from ..steppers.event_exact import EventExact
-from .multiple_shooting import AT_SECTION, LOOKS, Phases, inside, phases_around
+from .multiple_shooting import AT_SECTION, LOOKS, Inside, Phases, inside, phases_around
 
 # A motion on the cycle returns to its start within this share of its size.
 BACK = 1e-6
@@ -24,6 +24,10 @@ class RealMotion(NamedTuple):
     start: Point  # its first state, in the middle of the longest phase
     seen: PeriodSummary
     phases: Phases | None
+
+    def moves_as(self, computed: Phases) -> bool:
+        """Whether it has the contact modes of the computed cycle: on a special point, rounding tells which way it goes."""
+        return self.phases is not None and self.phases.has_the_modes_of(computed)
 
 
 def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> RealMotion | None:
@@ -47,13 +51,8 @@ def amplitude(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotio
     """The peak tangential speed (m/s) of a cycle: of its real motion; unless rounding makes that touch again and again where
     the cycle grazes, so that it comes to no end, or go another way where that is about to change. Then of the computed phases.
     """
-    segments, seen = real.seen.segments, float(real.seen.amplitude)
-    computed = _highest_speed(scene, stepper, phases)
-    goes_round = abs(np.sum(segments.h) - phases.period) <= 1e-9 * phases.period
-    return seen if goes_round and abs(seen - computed) <= 1e-4 * seen else computed
-
-
-def _highest_speed(scene: Scene, stepper: EventExact, phases: Phases) -> float:
+    if real.moves_as(phases) and abs(np.sum(real.seen.segments.h) - phases.period) <= 1e-9 * phases.period:
+        return float(real.seen.amplitude)
     tangential, _ = contact_coordinates(scene.structure)
     places = scene.structure.size + np.atleast_1d(tangential)
     # Looks at all phases, then finer ones about the highest speed.
@@ -75,13 +74,23 @@ def on_section(scene: Scene, stepper: EventExact, phases: Phases, real: RealMoti
     """The first crossing of the section on a computed cycle; None if there is none."""
     if phases.modes[0].ending == AT_SECTION:
         return real.start
-    # On a cycle that grazes, rounding tells what follows the touch: from elsewhere the section may come before it.
+    # Where the real motion goes another way, from just before the section.
     maps = ReturnMaps.of(scene)
-    return _reached(maps, [real.start]) or _reached(maps, _states(scene, stepper, phases, range(1, LOOKS)))
+    starts = [real.start] if real.moves_as(phases) else _before_section(maps, inside(scene, stepper, phases), phases)
+    return _reached(maps, starts) or _reached(maps, _states(scene, stepper, phases, range(1, LOOKS)))
+
+
+def _before_section(maps: ReturnMaps, looked: Inside, phases: Phases) -> list[Point]:
+    """The last states at which the guards were looked at before the section is crossed inside a phase."""
+    speed = looked.states[:, :, maps.structure.size :] @ maps.section
+    places = np.argwhere((speed[:, :-1] < 0) & (speed[:, 1:] >= 0)).tolist()
+    return [Point(looked.states[k, look], phases.modes[k].contact) for k, look in places]
 
 
 def _reached(maps: ReturnMaps, starts: list[Point]) -> Point | None:
     """The next crossing of the section from the first of these states from which there is one."""
+    if not starts:
+        return None
     found = maps.returns(np.zeros(len(starts), int), Section.of(*starts), 1).at
     reached = np.flatnonzero(np.all(np.isfinite(found.y), axis=1))
     return found.point(int(reached[0])) if len(reached) else None

@@ -134,7 +134,8 @@ def _has_signal(search: FitSearch, problem: Problem, models) -> bool:
     for mine, model in zip(problem.misfits, models, strict=True):
         measured, sigma = np.asarray(mine.means), np.asarray(mine.sigma)
         before = measured - measured.mean(axis=0) if isinstance(mine, CycleMisfit) else measured
-        explained = np.sum((before / sigma) ** 2) - np.sum(((measured - model) / sigma) ** 2)
+        with np.errstate(over="ignore", invalid="ignore"):
+            explained = np.sum((before / sigma) ** 2) - np.sum(((measured - model) / sigma) ** 2)
         if explained > significant * (len(search.best.x) + mine.projected):
             return True
         if exceeds_noise(measured, sigma):
@@ -149,7 +150,8 @@ def _share_left(problem: Problem, models) -> float:
         measured, kept = np.asarray(mine.means), np.asarray(mine.kept)
         weight, noise = kept / np.asarray(mine.sigma), np.sum(kept)
         before = measured - measured.mean(axis=0) if isinstance(mine, CycleMisfit) else measured
-        energy, left = (np.sum((weight * part) ** 2) - noise for part in (before, measured - model))
+        with np.errstate(over="ignore", invalid="ignore"):
+            energy, left = (np.sum((weight * part) ** 2) - noise for part in (before, measured - model))
         shares.append(left / energy if energy > 0 else 0.0)
     return float(max(shares))
 

@@ -193,6 +193,12 @@ def _check_samples(recording: Recording, k: int) -> None:
     varies = np.ptp(recording.values, axis=0) > 0
     if not np.any(varies):
         raise ValueError(f"Recording {k} is the same at every sample, so it tells nothing. Was the sensor connected?")
+    if recording.noise is None and not np.all(varies):
+        still = recording.channels[int(np.argmin(varies))]
+        raise ValueError(
+            f"Recording {k} is the same at every sample of channel `{still}`, so that its noise cannot be estimated. Leave the "
+            f"channel out, or give `noise`."
+        )
     largest = np.max(np.abs(recording.values), axis=0)
     for channel, value in zip(recording.channels, largest, strict=True):
         # Squares of what is beyond these are no longer numbers.

@@ -85,4 +85,6 @@ def matrix_of(place: str, value) -> FileMatrix:
             raise ValueError(
                 f"{place} must be a square matrix of numbers, but has shape {value.shape} and type {value.dtype}."
             )
+        # In this machine's order of bytes, and no shorter than its numbers are.
+        value = value.astype(np.result_type(value.dtype, np.float64))
     return FileMatrix(sparse.csr_array(value), None, place)

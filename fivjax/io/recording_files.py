@@ -197,8 +197,12 @@ def _wav(path: Path):
             rate, samples = wavfile.read(io.BytesIO(content))
     except ZeroDivisionError:
         raise unreadable(path, "WAV", "it declares 0 tracks") from None
+    except UnboundLocalError:
+        raise unreadable(path, "WAV", "it has no format, or no samples") from None
     except Exception as error:  # what the library raises for damaged files, of many kinds
         raise unreadable(path, "WAV", error) from None
+    if not samples.size:
+        raise unreadable(path, "WAV", "it has no samples")
     with np.errstate(invalid="ignore"):  # what is no number is refused with its place
         scaled = np.asarray(samples, float)
     if samples.dtype.kind == "u":  # it rests at 128

@@ -537,6 +537,17 @@ def test_a_branch_ends_where_larger_static_friction_begins_to_hold_a_reversal_of
 
 
 @pytest.mark.slow
+def test_beyond_a_gap_special_points_are_named_as_seen_from_the_start():
+    """Before 0.17516 the slip goes back for a while; beyond, the contact is held at once."""
+    scene = dataclasses.replace(paper(1.0, 0.227), friction=fj.Coulomb(0.227, 0.3))
+    branch = fj.continue_cycle(scene, "mu", (0.1, 0.29))
+    at = int(np.argmin(np.abs(branch["parameter"].values - 0.175162705)))
+    assert str(branch["special"].values[at]) == "edge of the friction cone: slip removed"
+    assert str(branch["word"].values[at + 1]).endswith("slide – slide back")
+    assert float(branch["amplitude"][at]) == pytest.approx(1.0212177, abs=2e-6)  # by the independent solver
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "by"), [("mu", 1e-4), ("k1", 20.0), ("belt_speed", 1e-3)])
 def test_the_edge_of_static_friction_moves_as_differences_say(name, by):
     value = float(HELD.parameters[name])

@@ -169,3 +169,29 @@ def test_of_contacts_that_move_alike_no_special_point_is_made_of_the_order_of_th
     }
     assert named.pop("fold") == pytest.approx(0.167966615703, rel=1e-9)
     assert all(mu == pytest.approx(0.182125040747, rel=1e-8) for mu in named.values())
+
+
+@pytest.mark.slow
+def test_the_state_at_an_edge_of_static_friction_is_on_the_cycle():
+    """Wherever rounding sends the motion there: with a little less static friction it goes round."""
+    matrices = [np.kron(np.eye(2), matrix) for matrix in fj.belt_oscillator().matrices[:3]]
+    other = fj.belt_oscillator(m1=0.5, m2=0.05, k1=102e3)
+    for matrix, own in zip(matrices, other.matrices[:3], strict=True):
+        matrix[3:, 3:] = own
+    apart = np.zeros(6)
+    apart[[0, 3]] = 1.0, -1.0
+    for matrix, value in ((matrices[1], 100.0), (matrices[2], 2e6)):
+        matrix += value * np.outer(apart, apart)
+    load = np.concatenate([fj.belt_oscillator().load_direction, other.load_direction])
+    structure = fj.Structure(*matrices, load, contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)])
+    laws = [fj.Coulomb(0.2, 0.3), fj.Coulomb(0.2, 0.26)]
+    scene = fj.Scene(structure, laws, 0.85, fj.ConstantLoad(100.0))
+    branch = fj.continue_cycle(scene, "belt_speed", (0.83, 0.86))
+    at = branch.isel(point=int(np.argmax(branch["special"].values == "edge of the friction cone at contact 0")))
+    assert float(at.parameter) == pytest.approx(0.8333963043, rel=1e-9)
+    laws[0] = fj.Coulomb(0.2, 0.3 - 1e-9)
+    scene = fj.Scene(structure, laws, float(at.parameter), fj.ConstantLoad(100.0))
+    start, period = np.split(at.state.values, 2), float(at.period)
+    run = fj.simulate(scene, period, period / 64, y0=tuple(start))
+    for own, reached in zip(start, (run.displacement[-1], run.velocity[-1]), strict=True):
+        np.testing.assert_allclose(reached, own, atol=1e-6 * np.max(np.abs(own)))

@@ -421,6 +421,7 @@ def test_other_guesses_do_not_lead_an_aliased_recording_away_from_the_scene():
         (dict(data=fj.Recording(25e3, {"a0": QUIET[:, 0]}, wear=0.2)), ["`wear`", "belt_speed"]),
         (dict(data=fj.Recording(25e3, {"a0": QUIET[:60, 0]})), ["too short"]),
         (dict(data=fj.Recording(25e3, {"a0": QUIET[:, 0], "v1": QUIET[:, 0]})), ["0", "same at every sample"]),
+        (dict(data=fj.Recording(25e3, {"a0": RISING, "v1": QUIET[:, 0]})), ["velocity 1", "same at every", "`noise`"]),
         (dict(data=fj.Recording(25e3, {"a0": 1e200 * RISING})), ["acceleration 0", "1e+200", "unit"]),
         (dict(data=fj.Recording(25e3, {"v1": 1e-200 * RISING})), ["velocity 1", "1e-200", "unit"]),
     ],

@@ -36,6 +36,19 @@ def test_matrices_of_matlab_are_what_scipy_saved(tmp_path):
             assert all(np.array_equal(found[name].matrix.toarray(), whole) for name in kept), version
 
 
+@pytest.mark.parametrize("kind", [">f8", ">i4", "<f2", ">c16"])
+def test_matrices_in_another_order_of_bytes(tmp_path, kind):
+    """Of measuring systems and old machines; and of a length that sparse matrices do not have."""
+    whole = np.array([[2.0, -1.0], [-1.0, 2.0]])
+    np.savez(tmp_path / "K.npz", K=whole.astype(kind), M=whole)
+    found = fj.read_matrices(tmp_path / "K.npz")
+    assert np.array_equal(found["M"].matrix.toarray(), whole)
+    if kind == ">c16":
+        assert "complex" in found.left_out["K"]
+    else:
+        assert np.array_equal(found["K"].matrix.toarray(), whole)
+
+
 @pytest.mark.parametrize("indices", [[0, 10**8, 1], [0, -7, 1]])
 def test_an_index_outside_the_matrix(tmp_path, indices):
     path = tmp_path / "K.npz"
@@ -98,6 +111,11 @@ def test_damaged_recordings(tmp_path):
     form = struct.pack("<4sIHHIIHH", b"fmt ", 16, 1, 0, 8000, 16000, 2, 16)  # no tracks
     content = b"WAVE" + form + struct.pack("<4sI4s", b"data", 4, bytes(4))
     (tmp_path / "r.wav").write_bytes(struct.pack("<4sI", b"RIFF", len(content)) + content)
+    empty = b"WAVE" + struct.pack("<4sIHHIIHH", b"fmt ", 16, 1, 1, 8000, 16000, 2, 16) + struct.pack("<4sI", b"data", 0)
+    for name, content in (("empty.wav", empty), ("nothing.wav", b"WAVE")):
+        (tmp_path / name).write_bytes(struct.pack("<4sI", b"RIFF", len(content)) + content)
+        with pytest.raises(ValueError, match=f"{name}` cannot be read as WAV: it has no "):
+            fj.read_recording(tmp_path / name)
     for name, said in (
         ("r.npz", "NumPy: Bad CRC-32"),
         ("r.mat", "MATLAB: error: .* while decompressing data"),
