@@ -303,7 +303,7 @@ REPELLED |= dict(theta=0.42108456857757953, c1=0.2555934258420111, c2=3.31813613
         # Eighteen crossings within 1e-4 of each other; other events 2e-6 away.
         (1.0582676904629036, 0.5698310189567666, RING, 0.1389),
         # A multiplier of 0.9995, and other events 8e-6 away.
-        (1.229556063695308, 0.467728818845026, EDGE, 0.1732),
+        pytest.param(1.229556063695308, 0.467728818845026, EDGE, 0.1732, marks=pytest.mark.slow),
         # The motion leaves a cycle with a multiplier of 1.0006, for which it takes ten thousand returns.
         (0.49047164000367716, 1.3202275538006947, REPELLED, 0.0921),
     ],
@@ -650,7 +650,7 @@ def test_a_cycle_meets_the_section_by_an_impact(paper_scene):
     assert run.fate == ["sustained"] and run.amplitude[0] == pytest.approx(cycle.amplitude, rel=1e-5)
 
 
-@pytest.mark.parametrize("along", [1.0, -1.0])
+@pytest.mark.parametrize("along", [1.0, pytest.param(-1.0, marks=pytest.mark.slow)])
 def test_a_cycle_meets_the_section_by_an_impact_after_which_it_sticks(along):
     """There the velocity is the belt's, and not free; a map's lanes were undecided. With x reversed it is met smoothly."""
     stiffness = np.array([[1.65, 0.23, -0.23], [0.23, 2.47, -0.43], [-0.23, -0.43, 1.28]])

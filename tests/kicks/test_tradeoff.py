@@ -95,6 +95,7 @@ def test_the_boundary_of_each_method(paper_scene):
     assert found["p_crit_error"].sel(stepper="fine") < found["p_crit_error"].sel(stepper="coarse")
 
 
+@pytest.mark.slow
 def test_refinement_is_compared_with_the_whole_map(monkeypatch):
     """Where nothing is left out it is right, and what it computes is told; a table of its own in the text."""
     monkeypatch.setattr(tradeoff_study, "COARSEST", 6)

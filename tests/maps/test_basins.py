@@ -92,7 +92,7 @@ def test_the_basin_of_benchmark_a_ends_where_a_trajectory_first_sticks():
             assert int(b["verdict"][i, j]) == (1 if run.t_events[0].size else 0), (x, dx)
 
 
-@pytest.mark.parametrize("along", [1.0, -1.0])
+@pytest.mark.parametrize("along", [1.0, pytest.param(-1.0, marks=pytest.mark.slow)])
 def test_a_lane_that_only_rebounds_has_no_other_event_and_comes_to_the_cycle_of_the_others(along):
     """A rebound was annulled where the section is crossed right after it, in one of the two orientations; and what never changes
     its contact mode was not asked whether it is captured. An impact of the cycle ends the slip: its highest speed is the belt's.
