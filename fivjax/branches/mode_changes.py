@@ -67,17 +67,17 @@ def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray
         return _reordered(family, curve, valid, gone[0]) or _removed(bracket, gone[0])
     if turned_back := _missed(bracket, ahead):
         return turned_back, None
-    vanishes = _vanishing(valid.phases, here.cycle.phases)
+    shrinks = _shrinking(valid.phases, here.cycle.phases)
     return (
         _inserted(bracket, ahead)
-        or (None if vanishes is None else _removed(bracket, vanishes, seen=True))
+        or (None if shrinks is None else _removed(bracket, shrinks, seen=True))
         or _grazes(curve, valid, ahead)
-        or (None if vanishes is None else _removed(bracket, vanishes))
+        or (None if shrinks is None else _removed(bracket, shrinks))
         or (Special("contact modes change", curve, bracket.last_real()), None)
     )
 
 
-def _vanishing(phases: Phases, before: Phases) -> int | None:
+def _shrinking(phases: Phases, before: Phases) -> int | None:
     """The phase that has become shortest beside its length before, if it has shrunk by half."""
     lasting = phases.lasting()
     among = [k for k in lasting if not before.is_at_once(k)] or lasting

@@ -25,21 +25,25 @@ def load_archive(path: Path) -> dict[str, np.ndarray]:
 
     **Raises:** `ValueError` for a file that is damaged, or that holds Python objects.
     """
-    found = {}
+    # What `zipfile` raises for damaged archives, and NumPy for damaged headers, is of many kinds.
     try:
-        with zipfile.ZipFile(path) as archive:
-            members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
-            check_declared(path, KIND, sum(member.file_size for member in members))
-            for member in members:
-                name = member.filename.removesuffix(".npy")
-                if name in found:
-                    raise unreadable(path, KIND, f"array `{name}` is there twice")
-                found[name] = _array(path, f"array `{name}`: ", archive.read(member))
-    except ValueError:
-        raise
-    except Exception as error:  # what `zipfile` raises for damaged archives, of many kinds
+        archive = zipfile.ZipFile(path)
+    except Exception as error:
         said = "it holds no arrays of numbers" if path.read_bytes()[:1] == b"\x80" else error
         raise unreadable(path, KIND, said) from None
+    found = {}
+    with archive:
+        members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+        check_declared(path, KIND, sum(member.file_size for member in members))
+        for member in members:
+            name = member.filename.removesuffix(".npy")
+            if name in found:
+                raise unreadable(path, KIND, f"array `{name}` is there twice")
+            try:
+                content = archive.read(member)
+            except Exception as error:
+                raise unreadable(path, KIND, error) from None
+            found[name] = _array(path, f"array `{name}`: ", content)
     return found
 
 
@@ -47,9 +51,7 @@ def _array(path: Path, where: str, content: bytes) -> np.ndarray:
     stream = io.BytesIO(content)
     try:
         array = np.lib.format.read_array(stream, allow_pickle=False)
-    except (
-        Exception
-    ) as error:  # a damaged header is evaluated, and makes a type, in steps that raise errors of many kinds
+    except Exception as error:
         raise unreadable(path, KIND, f"{where}{error}") from None
     if stream.read(1):
         raise unreadable(path, KIND, f"{where}it declares shape {array.shape} of {array.dtype}, but more bytes follow")
