@@ -119,8 +119,9 @@ def _static_edges(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
         if before.ending == AT_SECTION or before.status[contact] == Status.STICK:
             continue
         if mode.status[contact] == Status.SLIDE and at_rest[k, contact]:
+            held = mode.with_mode_of(contact, (int(Status.STICK), 0.0))
             places += [k, k]
-            modes += [mode.sticking(contact)._replace(ending=2 * contact + which) for which in range(2)]
+            modes += [held._replace(ending=2 * contact + which) for which in range(2)]
     if not places:
         return []
     none = np.zeros(len(places))

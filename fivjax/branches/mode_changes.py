@@ -190,7 +190,7 @@ def _reordered(family: Family, curve: Curve, valid: ComputedCycle, phase: int):
         return None
     cycle = special.cycle
     modes[phase - 1] = before._replace(ending=own.ending)
-    modes[phase] = before.with_mode_of(second, after)._replace(ending=before.ending)
+    modes[phase] = before.with_mode_of(second, after.mode_of(second))._replace(ending=before.ending)
     ends = images_of_phases(
         family.at(cycle.parameter),
         family.direction,

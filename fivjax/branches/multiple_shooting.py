@@ -57,16 +57,10 @@ class Mode(NamedTuple):
         """What one of the contacts does."""
         return self.status[contact], self.direction[contact]
 
-    def with_mode_of(self, contact: int, other: "Mode") -> "Mode":
-        """The mode in which that contact does what it does in another one."""
+    def with_mode_of(self, contact: int, mode: tuple[int, float]) -> "Mode":
+        """The mode in which that contact does this instead (see `mode_of`)."""
         status, direction = list(self.status), list(self.direction)
-        status[contact], direction[contact] = other.mode_of(contact)
-        return self._replace(status=tuple(status), direction=tuple(direction))
-
-    def sticking(self, contact: int) -> "Mode":
-        """The mode in which that contact sticks."""
-        status, direction = list(self.status), list(self.direction)
-        status[contact], direction[contact] = int(Status.STICK), 0.0
+        status[contact], direction[contact] = mode
         return self._replace(status=tuple(status), direction=tuple(direction))
 
     @property

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # A multiplier counts as inside the unit circle if its size is below one by at least this.
 MARGIN = 1e-9
+# What not every cycle has.
+OPTIONAL = ("rotation_number", "reach", "contraction")
 
 
 class LimitCycle(eqx.Module):
@@ -126,9 +128,7 @@ class LimitCycle(eqx.Module):
                 Phase(Status(one) if isinstance(one, int) else tuple(map(Status, one)), duration)
                 for one, duration in word
             ]
-            optional = {
-                name: float(attrs[name]) for name in ("rotation_number", "reach", "contraction") if name in attrs
-            }
+            optional = {name: float(attrs[name]) for name in OPTIONAL if name in attrs}
             size = points.shape[1] // 2
             return cls(
                 scene=scene,
@@ -155,7 +155,7 @@ class LimitCycle(eqx.Module):
         """One period with names, units and the scene it came from; with its multipliers and points of the section."""
         dataset = self.trajectory().to_dataset()
         each = ("contact",) * np.ndim(self.contact.status)
-        optional = {name: getattr(self, name) for name in ("rotation_number", "reach", "contraction")}
+        optional = {name: getattr(self, name) for name in OPTIONAL}
         return dataset.assign(
             multiplier_real=("multiplier", self.multipliers.real),
             multiplier_imaginary=("multiplier", self.multipliers.imag),

@@ -1,4 +1,6 @@
-"""Structures by functions of one's own that this process has made: datasets hold none of their code, and find it here."""
+"""Structures by functions of one's own: what their parameters may be called, and those that this process has made, because
+datasets hold none of their code, and find it here.
+"""
 
 from collections.abc import Callable, Hashable
 from typing import Any
