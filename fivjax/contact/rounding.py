@@ -118,21 +118,23 @@ def _one_size(mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], 
     determinant = g_tt * g_nn - tn**2
     static = mechanics.friction.static
     compliance = jnp.abs(mechanics.normal_compliance(contact.direction, static))
-    sliding_n = free_n / jnp.where(compliance > 0, compliance, 1.0)
+    # All coefficients of a series have these divisors.
+    over_compliance, over_determinant = 1.0 / jnp.where(compliance > 0, compliance, 1.0), 1.0 / determinant
+    sliding_n = free_n * over_compliance
     none = jnp.zeros_like(free_n)
-    stick_t, stick_n = (g_tn * free_n + g_nn * free_t) / determinant, (g_tn * free_t + g_tt * free_n) / determinant
+    stick_t = (g_tn * free_n + g_nn * free_t) * over_determinant
+    stick_n = (g_tn * free_t + g_tt * free_n) * over_determinant
     tangential_force = by_status(contact, stick=stick_t, slide=static * sliding_n, detach=none)
     normal_force = by_status(contact, stick=stick_n, slide=sliding_n, detach=none)
     if mechanics.rest is None:
         return tangential_force, normal_force, none, none
     rest_n = jnp.abs(mechanics.rest.normal_force)
-    resting_n = by_status(
-        contact, stick=none, slide=g_tn * _other_friction(mechanics, contact) * rest_n / compliance, detach=rest_n
-    )
+    replaced = g_tn * _other_friction(mechanics, contact) * rest_n * over_compliance
+    resting_n = by_status(contact, stick=none, slide=replaced, detach=rest_n)
     # Slip begins with an acceleration that is the rounding error of the margin at which sticking ended. If it counted as more
     # than zero, sticking and sliding would follow each other for ever.
     edge = static * stick_n + stick_t
-    onset = jnp.where(contact.status == Status.SLIDE, edge * jnp.abs(determinant) / compliance, 0.0)
+    onset = jnp.where(contact.status == Status.SLIDE, edge * jnp.abs(determinant) * over_compliance, 0.0)
     return tangential_force, normal_force, resting_n, onset
 
 

@@ -123,20 +123,20 @@ class EventExact(AbstractStepper):
         guards, rounding = (rows.reshape(len(rows), -1) for rows in (series.guards, rounding))
         exact = physics.exactly_zero(contact).T.ravel()
         n, count = y.shape[0] // 2, 2 * len(mechanics.places)
-        before = before_section(mechanics, y)
+        before, ends = before_section(mechanics, y), np.ones(count, bool)
         if at_section:
             # One more row for the rise through zero of the tangential velocity, no event of the contact; or for its fall.
             speed = jax.vmap(lambda state: section_speed(mechanics, state))(states)
             guards = jnp.concatenate([guards, jnp.where(before, -speed, speed)[:, None]], axis=1)
             # With several contacts, a small distance from the section is no rounding error.
             rounding = jnp.pad(rounding, ((0, 0), (0, 1)))
-            exact = jnp.append(exact, mechanics.several)
+            exact, ends = jnp.append(exact, mechanics.several), jnp.append(ends, before)
         reach = jnp.minimum(h / unit, self._longest(mechanics, contact, series, unit))
         # Before the coefficients are scaled by it: over a longer time they may diverge, and roots be wrong.
         reach = reach * self._agreeing(mechanics, contact, series, reach)
         scaled = in_shares(guards, reach)
         near = jnp.minimum(1.0, NEAR / jax.lax.stop_gradient(reach))
-        safe, fires = march_to_roots(jax.lax.stop_gradient(scaled), in_shares(rounding, reach), exact, near)
+        safe, fires = march_to_roots(jax.lax.stop_gradient(scaled), in_shares(rounding, reach), exact, near, ends)
         if at_section:
             # A fall is no event; but where there is a rise behind it, the step ends a little after it, so that the next one
             # sees the rise.

@@ -1,5 +1,7 @@
 """Where guards run out along a step, from their Taylor series."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,82 +42,112 @@ def together(
     return jnp.concatenate([of_contacts, fires[count:]])
 
 
+class _Guards(NamedTuple):
+    """Guards as polynomials on [0, 1], without what is no more than rounding at their start."""
+
+    c: Float[Array, "k g"]
+    begin: Float[Array, " g"]  # up to here there is no root
+    spent: Bool[
+        Array, " g"
+    ]  # at the start already: by a jump, or where the last advance ended a rounding short of a root
+    scale: Float[Array, " g"]  # one over the size
+    # Relative to the size, the second derivative is nowhere less than minus the first of these, and a third of the third
+    # derivative between minus the second and the last.
+    bound_2: Float[Array, " g"]
+    bound_3: Float[Array, " g"]
+    largest_3: Float[Array, " g"]
+
+
 def march_to_roots(
     c: Float[Array, "k g"],
     rounding: Float[Array, "3 g"] | None = None,
     exact: Bool[Array, " g"] | None = None,
     near: Float[Array, ""] | float = 1.0,
+    ends: Bool[Array, " g"] | bool = True,
 ) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
     r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
 
-    It marches from zero by steps d in which no root is possible: a lower bound on the second derivative gives
-    $g + g' d - B_2 d^2 / 2 > 0$, and where $g$, $g'$ and $g''$ are positive, one on the third gives
-    $g' + g'' d / 2 - B_3 d^2 / 6 > 0$, which is needed at the flat start after a lift-off. On [0, 1] the negative coefficients
-    alone give the bounds. So no root is skipped, a dip below zero inside the interval is found at its first crossing, and near
-    a simple root the march converges quadratically. Roots at zero, where the status began, are divided out; with an `exact`
-    start, a small value there is no rounding error. What is small is told on [0, `near`]: over a long time a straight motion
-    makes any value at the start small. A march that uses up its steps has still shown that there is no root up to where it
-    came; and one that has passed the root of an earlier polynomial ends there.
+    The negative coefficients alone bound it from below: there is no root before the first coefficient is used up by their sum.
+    From there it marches by steps d in which no root is possible. They bound the second and the third derivative, too: by
+    $-B_2$ and $-B_3$. So up to a distance D there is $g + g' d - B d^2 / 2 > 0$ with $B = \min(B_2, B_3 D / 3 - g'')$; with
+    $D = 2 g / |g'|$ the march converges cubically near a simple root. No root is skipped, and a dip below zero inside the
+    interval is found at its first crossing.
+
+    A root at zero, where the status began, does not count; with an `exact` start, a small value there is no rounding error.
+    What is small is told on [0, `near`]: over a long time a straight motion makes any value at the start small. A march that
+    uses up its steps has still shown that there is no root up to where it came. Behind the root of a polynomial that `ends` the
+    advance none goes on.
     """
     count = c.shape[1]
     rounding = jnp.zeros((3, count), c.dtype) if rounding is None else rounding
     exact = jnp.zeros(count, bool) if exact is None else exact
+    guards = _from_start(c, rounding, exact, near)
 
-    def further(first, of_one):
+    def further(way):
+        x, going, found, steps = way
         # Roots that differ by rounding only are found.
-        x, found = _first_root(*of_one, near=near, until=jnp.minimum(first * (1 + 16 * jnp.finfo(c.dtype).eps), 1.0))
-        return jnp.minimum(first, x), (x, found)
+        first = jnp.min(jnp.where(found & ends, x, 1.0))
+        until = jnp.minimum(first * (1 + 16 * jnp.finfo(c.dtype).eps), 1.0)
+        there, is_root = _further(guards, x, until)
+        x, found = jnp.where(going, there, x), found | (going & is_root)
+        return x, going & ~is_root & (x < until), found, steps + 1
 
-    # One after the other: a march of few steps does not wait for a long one.
-    return jax.lax.scan(further, jnp.ones((), c.dtype), (c.T, rounding.T, exact))[1]
+    begin = guards.begin, ~guards.spent & (guards.begin < 1), guards.spent, jnp.zeros((), jnp.int32)
+    x, _, found, _ = jax.lax.while_loop(lambda way: jnp.any(way[1]) & (way[3] < MOST_ROOT_STEPS), further, begin)
+    return x, found
 
 
-def _first_root(
-    c: Float[Array, " k"], rounding: Float[Array, "3"], exact: Bool[Array, ""], *, near, until
-) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    eps, sizes = float(jnp.finfo(c.dtype).eps), jnp.abs(c)
-    size = jnp.sum(sizes)
-    of_near = size - (1 - near) * (size - sizes[0])
-    powers = [1.0, near, near * near]
-    first = [[own[k] * power for k, power in enumerate(powers)] for own in (c, rounding)]
-    one, two, three = zero_at_start(first[0], of_near, first[1], exact)
-    for by, divided in ((2, two), (1, (one & ~two) | three)):
-        c = jnp.where(divided, jnp.concatenate([c[by:], jnp.zeros(by, c.dtype)]), c)
+def _from_start(
+    c: Float[Array, "k g"], rounding: Float[Array, "3 g"], exact: Bool[Array, " g"], near: Float[Array, ""] | float
+) -> _Guards:
     k = np.arange(len(c))
-    falling = jnp.where(c < 0, -c, 0.0)
-    # Its negative coefficients alone cannot use it up.
-    lasts = c[0] > jnp.sum(falling[1:])
-    bound_2, bound_3 = (jnp.sum(falling * of.astype(c.dtype)) for of in (k * (k - 1), k * (k - 1) * (k - 2)))
-    huge = 1.0 / eps
-    # Already used up: after a jump of the load, or if the last advance ended short of the root by rounding.
-    spent = c[0] < 0
+    # By these, the coefficients make the sum of all, and bounds on the second derivative and on a third of the third.
+    weights = np.array([np.ones(len(c)), k * (k - 1), k * (k - 1) * (k - 2) / 3], c.dtype)
+    first, later = c[:3], c[3:]
 
-    def going(carry):
-        x, step, count = carry
-        return ~spent & (x < until) & (step > 2 * eps * x) & (count < MOST_ROOT_STEPS)
+    def more(sums, row):
+        own, weights = row
+        return [total + weights[:, None] * part for total, part in zip(sums, (jnp.abs(own), own), strict=True)], None
 
-    def cubic(slope, bend):
-        return ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
+    # A loop that XLA unrolls, and that kernels keep.
+    none = jnp.zeros((3, c.shape[1]), c.dtype)
+    (sizes, sums), _ = jax.lax.scan(more, [none, none], (later, weights.T[3:]), unroll=True)
+    size = sizes[0] + jnp.sum(jnp.abs(first), axis=0)
+    of_near = size - (1 - near) * (size - jnp.abs(first[0]))
+    powers = jnp.stack([near**j * jnp.ones_like(size) for j in range(3)])
+    zero = zero_at_start(first * powers, of_near, rounding * powers, exact)
+    first = jnp.where(jnp.stack(zero), 0.0, first)
+    lead = first[0]
+    for own in (first[1], first[2], *later[:2]):
+        lead = jnp.where(lead == 0, own, lead)
+    # The sums of negative coefficients alone are half of the difference of both.
+    falling = 0.5 * (sizes - sums) + jnp.tensordot(weights[:, :3], jnp.maximum(-first, 0.0), 1)
+    spent, scale = lead < 0, ratio(1.0, size, 0.0)
+    begin = jnp.where(spent, 0.0, jnp.minimum(ratio(lead, falling[0], 1.0), 1.0))
+    bounds = scale * falling[1], scale * falling[2], scale * sizes[2]
+    return _Guards(jnp.concatenate([first, later]), begin, spent, scale, *bounds)
 
-    def march(carry):
-        x, _, count = carry
-        value, slope, bend = jax.lax.cond(
-            x > 0, lambda x: value_slope_and_bend(c, x), lambda x: (c[0], c[1], 2 * c[2]), x
-        )
-        value = jnp.where(value > 0, value, 0.0)
-        root = jnp.sqrt(slope**2 + 2 * bound_2 * value)
-        # Two forms of the same root, each used where it has no cancellation.
-        falls = slope < 0
-        step = ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
-        rises = (slope >= 0) & (bend >= 0)
-        step = jax.lax.cond(rises, lambda *way: jnp.maximum(step, cubic(*way)), lambda *_: step, slope, bend)
-        return x + step, step, count + 1
 
-    none = jnp.zeros_like(size)
-    begin = jnp.where(lasts, 1.0, none), none + 1, jnp.zeros((), jnp.int32)
-    x, step, _ = jax.lax.while_loop(going, march, begin)
-    found = spent | ((x < until) & (step <= 2 * eps * x))
-    return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
+def _further(
+    guards: _Guards, x: Float[Array, " g"], until: Float[Array, ""]
+) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
+    """A step along guards, up to `until` at most; and whether their roots are where it ends."""
+    eps = float(jnp.finfo(x.dtype).eps)
+    value, slope, bend = (guards.scale * own for own in value_slope_and_bend(guards.c, x))
+    value = jnp.where(value > 0, value, 0.0)
+    falls, far, steep = slope < 0, until - x, slope**2
+    bound = jnp.minimum(guards.bound_3 * far - bend, guards.bound_2)
+    # Where it falls, both times the square of the slope: then D needs no division.
+    by_third = steep**2 - 2 * value * (2 * guards.bound_3 * value * slope + bend * steep)
+    by_second = steep * (steep + 2 * guards.bound_2 * value)
+    under_root = jnp.where(falls, jnp.minimum(by_third, by_second), steep + 2 * bound * value)
+    root = jnp.sqrt(jnp.maximum(under_root, 0.0))
+    step = ratio(jnp.where(falls, -2 * value * slope, slope + root), jnp.where(falls, steep + root, bound), 1.0)
+    inside = step < far
+    x = jnp.where(inside, x + step, until)
+    # After a step that ends at the root but for rounding, none more is needed to see it.
+    at_root = falls & (root > 0) & (2 * guards.largest_3 * value * step**2 <= eps * x * steep)
+    return x, inside & (x < until) & (at_root | (step <= 2 * eps * x))
 
 
 def implicit_root(

@@ -31,8 +31,9 @@ def agreeing(
 ) -> Float[Array, ""]:
     """The share of a step of length `reach` over which the series of μ is the law at the series' slip speed.
 
-    Where the two part, because the series ends too soon or the law has a kink there, bisection finds the place. The step then
-    ends just beyond it, so that the next one begins on the other side of a kink.
+    Where the two part, because the series ends too soon or the law has a kink there, the step ends at the last place before.
+    If there is none, bisection finds where they part. The step then ends just beyond it, so that the next one begins on the
+    other side of a kink.
     """
     # The difference that counts as rounding, in units of the last place of μ.
     roundings = 128
@@ -54,11 +55,11 @@ def agreeing(
     places = jnp.concatenate([equal, turning])
     wrong = jax.vmap(parted)(places, jnp.concatenate([speeds, at_turning]))
     high = jnp.min(jnp.where(wrong, places, jnp.inf))
-    low = jnp.max(jnp.where(places < high, places, 0.0))
+    before = jnp.max(jnp.where(places < high, places, 0.0))
 
     def going(carry):
         low, high, count = carry
-        return jnp.isfinite(high) & (high - low > 4 * eps * high) & (count < MOST_HALVINGS)
+        return (before == 0) & jnp.isfinite(high) & (high - low > 4 * eps * high) & (count < MOST_HALVINGS)
 
     def halved(carry):
         low, high, count = carry
@@ -66,8 +67,8 @@ def agreeing(
         beyond = parted(middle, value_and_slope(u, middle)[0])
         return jnp.where(beyond, low, middle), jnp.where(beyond, middle, high), count + 1
 
-    _, high, _ = jax.lax.while_loop(going, halved, (low, high, jnp.zeros((), jnp.int32)))
-    return jnp.clip(high, SHORTEST, 1.0)
+    _, beyond, _ = jax.lax.while_loop(going, halved, (before, high, jnp.zeros((), jnp.int32)))
+    return jnp.clip(jnp.where((before > 0) & jnp.isfinite(high), before, beyond), SHORTEST, 1.0)
 
 
 def _turning(
