@@ -244,6 +244,19 @@ def test_first_roots_of_random_polynomials_agree_with_all_their_roots():
     assert fires.sum() > 50
 
 
+def test_only_what_ends_the_advance_stops_the_march_along_others():
+    """Velocity that falls through the section is no event: a guard that runs out later is still found."""
+    from fivjax.steppers.guard_roots import march_to_roots
+
+    with jax.enable_x64(True):
+        c = jnp.array([[0.7, 0.3], [-1.0, -1.0], [0.0, 0.0]])  # 0.7 - x and 0.3 - x
+        x, fires = jax.jit(march_to_roots)(c, ends=jnp.array([True, False]))
+        np.testing.assert_allclose(x, [0.7, 0.3], rtol=1e-15)
+        assert fires.tolist() == [True, True]
+        x, fires = jax.jit(march_to_roots)(c, ends=jnp.array([True, True]))
+        assert fires.tolist() == [False, True] and x[1] == pytest.approx(0.3, rel=1e-15) and x[0] < 0.31
+
+
 def test_a_step_clipped_to_any_length_is_exact(paper_scene):
     """Event times must not depend on where advances happen to end: saved at different distances, the states agree."""
     scene = paper_scene.replace(p=1.3)
