@@ -244,17 +244,52 @@ def test_first_roots_of_random_polynomials_agree_with_all_their_roots():
     assert fires.sum() > 50
 
 
+def test_the_first_of_several_series_that_begin_at_zero_to_run_out_is_found():
+    """As guards do: series of order 20, some of which begin at zero, marched along together. NumPy finds all roots."""
+    from fivjax.steppers.guard_roots import march_to_roots
+
+    rng = np.random.default_rng(3)
+    c = rng.normal(size=(600, 21, 3)) * rng.uniform(0.5, 3.0, (600, 1, 3)) ** np.arange(21)[:, None]
+    c /= np.cumprod(np.maximum(np.arange(21), 1.0))[:, None]
+    begins = rng.integers(0, 4, (600, 3))
+    c[np.arange(21)[:, None] < begins[:, None]] = 0.0
+    lead = np.take_along_axis(c, begins[:, None], axis=1)
+    np.put_along_axis(c, begins[:, None], np.abs(lead) + 1e-3, axis=1)
+    with jax.enable_x64(True):
+        x, fires = map(np.asarray, jax.jit(jax.vmap(march_to_roots))(c))
+    found, given_up = 0, 0
+    for own, first, ends, fired in zip(c, begins, x, fires, strict=True):
+        roots = [np.roots(own[k:, g][::-1]) for g, k in enumerate(first)]
+        real = [one[(np.abs(one.imag) < 1e-7) & (one.real > 0) & (one.real < 1)].real for one in roots]
+        expected = np.array([np.min(one, initial=np.inf) for one in real])
+        if np.min(expected) > 1 - 1e-6 or np.any(np.abs(np.concatenate(roots).imag) < 1e-5) != any(map(len, real)):
+            continue  # a root that hardly is one
+        if not np.isfinite(expected).any():
+            assert not fired.any() and (ends == 1.0).all()
+            continue
+        earliest = np.argmin(expected)
+        if not fired[np.argmin(ends)]:  # so far there is no root, but the steps were used up
+            assert np.min(ends) < expected[earliest]
+            given_up += 1
+            continue
+        assert fired[earliest] and ends[earliest] == pytest.approx(expected[earliest], rel=1e-8)
+        assert np.min(ends) == ends[earliest]
+        found += 1
+    assert found > 200 and given_up < 5
+
+
 def test_only_what_ends_the_advance_stops_the_march_along_others():
     """Velocity that falls through the section is no event: a guard that runs out later is still found."""
     from fivjax.steppers.guard_roots import march_to_roots
 
     with jax.enable_x64(True):
-        c = jnp.array([[0.7, 0.3], [-1.0, -1.0], [0.0, 0.0]])  # 0.7 - x and 0.3 - x
+        c = jnp.array([[0.2, 0.3], [2.0, -1.0], [-4.0, 0.0]])
+        late, soon = (1 + np.sqrt(1.8)) / 4, 0.3
         x, fires = jax.jit(march_to_roots)(c, ends=jnp.array([True, False]))
-        np.testing.assert_allclose(x, [0.7, 0.3], rtol=1e-15)
+        np.testing.assert_allclose(x, [late, soon], rtol=1e-14)
         assert fires.tolist() == [True, True]
         x, fires = jax.jit(march_to_roots)(c, ends=jnp.array([True, True]))
-        assert fires.tolist() == [False, True] and x[1] == pytest.approx(0.3, rel=1e-15) and x[0] < 0.31
+        assert fires.tolist() == [False, True] and x[1] == pytest.approx(soon, rel=1e-15) and x[0] < 0.31
 
 
 def test_a_step_clipped_to_any_length_is_exact(paper_scene):
