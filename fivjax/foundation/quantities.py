@@ -68,6 +68,7 @@ QUANTITIES = {
         for name in ("c1", "c2")
     },
     "impact_loss": ("mechanical energy lost in re-contacts", "J"),
+    "impact": ("mechanical energy lost in re-contacts", "J"),
     "impact_dissipated": ("energy dissipated in re-contacts", "J"),
     "energy_exchanged": ("energy exchanged, to measure the residual against", "J"),
     "kick_energy": ("energy of the vibration when the kick ends", "J"),

@@ -113,11 +113,13 @@ class Recording(eqx.Module):
         arguments.one_of("regime", regime, regimes)
         samplings = ("points", "averages")
         arguments.one_of("sampling", sampling, samplings)
-        if not isinstance(signals, Mapping) or not signals:
+        if not isinstance(signals, Mapping):
             raise TypeError(
                 f"Argument `signals` must map channels to arrays, such as {{'acceleration 0': a}}, but is "
                 f"{arguments.describe(signals)}."
             )
+        if not signals:
+            raise ValueError("Argument `signals` must hold a channel, such as {'acceleration 0': a}, but is empty.")
         by_channel = {channel(name): _signal(str(name), values) for name, values in signals.items()}
         if len(by_channel) != len(signals):
             raise ValueError("Argument `signals` names one channel twice.")

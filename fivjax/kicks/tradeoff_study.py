@@ -186,6 +186,8 @@ def _check(scene, methods, t1, trajectories, precisions, boundary, refine) -> No
     arguments.real_number("t1", t1, above=0)
     arguments.whole_number("trajectories", trajectories, minimum=1)
     refuse_painleve(scene)
+    if not precisions:
+        raise ValueError("Argument `precisions` must hold at least one of 'float64' and 'float32', but is empty.")
     for kind in precisions:
         arguments.one_of("precisions", kind, ("float64", "float32"))
     arguments.truth("boundary", boundary)

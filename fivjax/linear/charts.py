@@ -17,6 +17,7 @@ from ..model.structure import Structure
 from .linearisation import linear_sliding, slope_damping, tangential_corner, time_scale
 from .polynomials import characteristic_polynomial, determinant, polynomial_roots
 from .routh_hurwitz import LARGEST_EXPANDED, hurwitz_determinants
+from .several_contacts import one_contact, sliding_motion
 from .system import with_axes
 
 if TYPE_CHECKING:
@@ -30,8 +31,8 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
         c = fj.cea.chart(fj.belt_oscillator(), mu=np.linspace(0, 0.5, 1000), k1=np.linspace(80e3, 120e3, 1000))
 
     The roots of the characteristic polynomial are found for all points together (`polynomial_roots`); `margin` is from
-    Routh–Hurwitz. Above 4 sliding coordinates the eigenvalues of the state matrix are computed point by point, without
-    `margin`.
+    Routh–Hurwitz. Above 4 sliding coordinates, and with several contacts, the eigenvalues of the state matrix are computed
+    point by point, without `margin`.
 
     **Arguments:**
 
@@ -41,9 +42,9 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     - `direction`: for a structure, +1 for a belt that moves along the tangential coordinate, -1 against it.
 
     **Returns:** a dataset over the two axes with `growth_rate` (1/s, of the fastest growing mode), `frequency` of
-    that mode (Hz), `margin` (the smallest Hurwitz determinant, positive where stable, without unit; up to 4 sliding
-    coordinates) and, for a scene, `normal_force` of steady sliding (N). NaN where there is no steady sliding, or where it is
-    not unique.
+    that mode (Hz), `margin` (the smallest Hurwitz determinant, positive where stable, without unit; one contact, up to 4
+    sliding coordinates) and, for a scene, `normal_force` of steady sliding (N; with several contacts the smallest). NaN where
+    there is no steady sliding, or where it is not unique.
 
     **Raises:** `ValueError` for anything but two axes, unknown names, and values that the structure or scene refuses.
 
@@ -59,7 +60,7 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     shape = grid[0].shape
     columns = [values.ravel() for values in grid]
     points = columns[0].size
-    expanded = scene.structure.size - 1 <= LARGEST_EXPANDED
+    expanded = _is_expanded(scene.structure)
     # Points that are computed together, by polynomials and by eigenvalues: the latter need a matrix for each.
     points_at_once, points_with_matrices = 8192, 64
     batch = min(points_at_once if expanded else points_with_matrices, points)
@@ -108,17 +109,26 @@ def _chart(scene, names, columns):
 
     def by_eigenvalues(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))
-        normal_force, exists = _steady_state(point)
-        matrix = linear_sliding(point).matrix
+        if one_contact(point.structure):
+            normal_force, exists = _steady_state(point)
+            matrix = linear_sliding(point).matrix
+        else:
+            matrix, forces = sliding_motion(point)
+            normal_force, exists = jnp.min(forces), jnp.all(forces >= 0) & jnp.all(point.belt_speed != 0)
         ok = exists & jnp.all(jnp.isfinite(matrix))
         roots = eigenvalues(jnp.where(ok, matrix, jnp.eye(matrix.shape[0])))
         fastest = jnp.argmax(roots.real)
         results = roots.real[fastest], jnp.abs(roots.imag[fastest]) / (2 * jnp.pi), jnp.nan
         return *(jnp.where(ok, r, jnp.nan) for r in results), normal_force
 
-    if scene.structure.size - 1 <= LARGEST_EXPANDED:
+    if _is_expanded(scene.structure):
         return jax.lax.map(by_polynomial, tuple(columns))
     return jax.lax.map(lambda chunk: jax.vmap(by_eigenvalues)(*chunk), tuple(columns))
+
+
+def _is_expanded(structure: Structure) -> bool:
+    """Whether the characteristic polynomial is written out."""
+    return one_contact(structure) and structure.size - 1 <= LARGEST_EXPANDED
 
 
 def _steady_state(scene: Scene):

@@ -9,6 +9,7 @@ from ..foundation import arguments
 from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..model.contact_coordinates import in_contact_coordinates
+from ..model.scene import refuse_several_contacts
 from ..model.structure import Structure
 from .critical import matrices_only
 from .crossings import first_limit
@@ -76,16 +77,20 @@ def coalescence(structure: Structure, *, damped: bool = False, direction: int = 
     **Returns:** a `Coalescence`. Where no two undamped modes meet, its outcome is "never unstable" and its numbers are
     NaN; where the damped point cannot be followed (heavy damping), it is "undecided".
 
+    **Raises:** `ValueError` for several contacts.
+
     **Example:**
 
         >>> round(float(fj.cea.coalescence(structure).mu), 5)
         0.22636
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    structure = in_contact_coordinates(structure)
+    refuse_several_contacts(structure, "`coalescence`", "`growth_rate` takes several.")
     arguments.instance("damped", damped, bool, "True or False")
     check_direction(direction)
     mu, omega, damped_mu, s, found, kept = jax.tree.map(
-        np.asarray, _coalescence(matrices_only(in_contact_coordinates(structure)), jnp.asarray(float(direction)))
+        np.asarray, _coalescence(matrices_only(structure), jnp.asarray(float(direction)))
     )
     if not found or (damped and not kept):
         outcome = StabilityOutcome.UNDECIDED if found else StabilityOutcome.NEVER_UNSTABLE

@@ -19,6 +19,7 @@ from ..foundation.kept_programs import kept
 from ..foundation.matrix_routines import log_determinant
 from ..foundation.precision import real, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
+from ..model.scene import refuse_several_contacts
 from ..model.sliding import sliding_matrices
 from ..model.structure import Structure
 from .linearisation import state_matrix, time_scale
@@ -61,7 +62,7 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
     **Arguments:** `structure`; `mu`, the friction coefficient, without unit; `direction`, +1 for a belt that moves
     along the tangential coordinate, -1 against it.
 
-    **Raises:** `ValueError` for a negative `mu`, or for more than 32 coordinates.
+    **Raises:** `ValueError` for a negative `mu`, more than 32 coordinates, or several contacts.
 
     **Example:**
 
@@ -69,6 +70,8 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
         (True, False)
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    structure = in_contact_coordinates(structure)
+    refuse_several_contacts(structure, "`margin`", "`growth_rate` takes several.")
     arguments.real_number("mu", mu, minimum=0)
     check_direction(direction)
     # The bialternate sum has N(N-1)/2 rows for N eigenvalues.
@@ -78,7 +81,7 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
             f"Argument `structure` must have at most {largest_size} coordinates here, but has {structure.size}. Use "
             f"`cea.growth_rate`, which has no such limit."
         )
-    return _margin(in_contact_coordinates(structure), real(mu), real(direction))
+    return _margin(structure, real(mu), real(direction))
 
 
 @kept

@@ -1,6 +1,7 @@
 """Bi-stability maps: the verdicts of many trajectories over any parameters, as a labelled dataset."""
 
 import contextlib
+import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -157,4 +158,8 @@ def bistability_map(
 
 def _known_by_now(limit: Future, verdicts: Verdicts) -> dict[str, float]:
     """The linear limit. Whoever interrupts a map does not wait for it."""
-    return {} if np.any(verdicts.pending()) and not limit.done() else limit.result()
+    try:
+        return {} if np.any(verdicts.pending()) and not limit.done() else limit.result()
+    except KeyboardInterrupt:
+        warnings.warn("Interrupted: all verdicts are known, but not `mu_crit` of linear theory.", stacklevel=3)
+        return {}

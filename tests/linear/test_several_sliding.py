@@ -192,3 +192,24 @@ def test_without_damping_a_contact_given_by_vectors_has_sensitivities():
 
     # To one side, because nothing holds the structure in one direction but the belt.
     assert found == pytest.approx((4 * limit(1.0) - limit(2.0) - 3 * limit(0.0)) / 2, rel=1e-5)
+
+
+def test_a_chart_of_several_contacts_has_their_growth_rates():
+    """Point by point, those of `growth_rate`; and NaN where there is no steady sliding."""
+    structure = coupled(1e5)
+    mu, force = np.linspace(0.25, 0.6, 4), [50.0, 100.0]
+    scene = fj.Scene(structure, fj.ExponentialDecay(0.3, 0.2, 0.5), 1.5, fj.Pulse(100.0, 1.2))
+    chart = fj.cea.chart(scene, mu_static=mu, force=force)
+    for i, value in enumerate(mu):
+        for j, load in enumerate(force):
+            own = scene.replace(mu_static=float(value), force=load)
+            assert chart["growth_rate"].values[i, j] == pytest.approx(
+                float(fj.cea.growth_rate(own)), rel=1e-9, abs=1e-9
+            )
+    assert "margin" not in chart and np.all(chart["normal_force"] > 0)
+    # On a belt that runs the other way, so much friction lifts one of them off.
+    mixed = fj.cea.chart(scene.replace(belt_speed=-1.5), mu_static=[0.3, 1e3], force=force)
+    assert np.isfinite(mixed["growth_rate"].values[0]).all() and np.isnan(mixed["growth_rate"].values[1]).all()
+    for function in (lambda: fj.cea.margin(structure, 0.2), lambda: fj.cea.coalescence(structure)):
+        with pytest.raises(ValueError, match="takes structures with one contact, but this one has 2"):
+            function()

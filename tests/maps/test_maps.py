@@ -276,6 +276,16 @@ def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
     assert m["verdict"].values.tolist() == [0, 0, 0, fj.Verdict.NOT_RUN]
 
 
+def test_a_map_interrupted_while_only_the_linear_limit_is_awaited_has_all_its_verdicts(paper_scene, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fivjax.maps.bistability.linear_limit", interrupted)
+    with pytest.warns(UserWarning, match="Interrupted: all verdicts are known, but not `mu_crit`"):
+        m = fj.bistability_map(paper_scene, mu=[0.1], p=[1.2], progress=False)
+    assert m["verdict"].item() == 0 and "mu_crit" not in m.attrs
+
+
 def test_islands_are_reported():
     """μ = 0.05, 3 m/s: sliding again near p = 7, above a limit cycle; the first crossing is not the only one."""
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.05), 3.0, fj.Pulse(100.0, 1.2))

@@ -214,6 +214,8 @@ def test_a_run_of_several_contacts_is_saved_and_drawn_with_one_panel_each(tmp_pa
     assert data["status"].dims == data["normal_force"].dims == ("t", "contact")
     assert np.allclose(data["stick_work_0"] + data["stick_work_1"], data["stick_work"], atol=1e-12)
     assert np.allclose(data["impact_0"] + data["impact_1"], data["impact_loss"], atol=1e-12)
+    assert all({"units", "long_name"} <= data[name].attrs.keys() for name in data.data_vars)
+    assert data["stick_time_1"].attrs == {"units": "s", "long_name": "time spent sticking, contact 1"}
     fj.save(run, tmp_path / "run.nc")
     again = fj.Trajectory.from_dataset(fj.open(tmp_path / "run.nc"))
     assert np.array_equal(again.status, run.status)
