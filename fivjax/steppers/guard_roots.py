@@ -47,9 +47,7 @@ class _Guards(NamedTuple):
 
     c: Float[Array, "k g"]
     begin: Float[Array, " g"]  # up to here there is no root
-    spent: Bool[
-        Array, " g"
-    ]  # at the start already: by a jump, or where the last advance ended a rounding before a root
+    spent: Bool[Array, " g"]  # at the start: by a jump, or where the last advance ended a rounding before a root
     scale: Float[Array, " g"]  # one over the size
     # Relative to the size, the second derivative is nowhere less than minus the first of these, and a third of the third
     # derivative between minus the second and the last.
