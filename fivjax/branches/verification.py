@@ -55,8 +55,8 @@ def amplitude(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotio
         return float(real.seen.amplitude)
     tangential, _ = contact_coordinates(scene.structure)
     places = scene.structure.size + np.atleast_1d(tangential)
-    # Looks at all phases, then finer ones about the highest speed.
-    for _ in range(2):
+    # Looks at all phases, then twice finer ones about the highest speed: a parabola through three of them is then exact.
+    for _ in range(3):
         states = inside(scene, stepper, phases).states
         speeds = np.abs(states[:, :, places])
         k, look, contact = np.unravel_index(np.argmax(speeds), speeds.shape)
