@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 def label(variable: "xr.DataArray") -> "xr.DataArray":
     """The variable with its long name and unit; that of one of several contacts has the contact's number behind its name."""
     name = str(variable.name)
-    quantity, _, contact = (name, "", "") if name in QUANTITIES else name.rpartition("_")
-    if quantity in QUANTITIES and (quantity == name or contact.isdecimal()):
+    quantity, contact = (name, "") if name in QUANTITIES else name.rpartition("_")[::2]
+    if quantity in QUANTITIES and (not contact or contact.isdecimal()):
         long_name, unit = QUANTITIES[quantity]
         variable.attrs.update(long_name=f"{long_name}, contact {contact}" if contact else long_name, units=unit)
     return variable

@@ -114,7 +114,7 @@ def _chart(scene, names, columns):
             matrix = linear_sliding(point).matrix
         else:
             matrix, forces = sliding_motion(point)
-            normal_force, exists = jnp.min(forces), jnp.all(forces >= 0) & jnp.all(point.belt_speed != 0)
+            normal_force, exists = jnp.min(forces), _slides(point, forces)
         ok = exists & jnp.all(jnp.isfinite(matrix))
         roots = eigenvalues(jnp.where(ok, matrix, jnp.eye(matrix.shape[0])))
         fastest = jnp.argmax(roots.real)
@@ -150,8 +150,12 @@ def _steady_state(scene: Scene):
         solved = solve(reduced[:, :-1], reduced[:, -1])
         bordered = table[n, -1] - table[n, keep] @ solved
     normal_force = -bordered / stiffness * scene.load.final
-    needed = normal_force
+    return normal_force, _slides(scene, normal_force)
+
+
+def _slides(scene: Scene, normal_forces):
+    """Whether there is steady sliding, by its normal forces (N)."""
     if scene.friction.constant:
         # With constant friction the sliding motion is linear and the same about any state.
-        needed = jnp.where(jnp.isfinite(normal_force), normal_force, 0.0)
-    return normal_force, (needed >= 0) & (speed > 0)
+        normal_forces = jnp.where(jnp.isfinite(normal_forces), normal_forces, 0.0)
+    return jnp.all(normal_forces >= 0) & jnp.all(jnp.abs(scene.belt_speed) > 0)

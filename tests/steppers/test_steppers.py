@@ -257,15 +257,18 @@ def test_the_first_of_several_series_that_begin_at_zero_to_run_out_is_found():
     np.put_along_axis(c, begins[:, None], np.abs(lead) + 1e-3, axis=1)
     with jax.enable_x64(True):
         x, fires = map(np.asarray, jax.jit(jax.vmap(march_to_roots))(c))
-    found, given_up = 0, 0
+    found, given_up, none = 0, 0, 0
     for own, first, ends, fired in zip(c, begins, x, fires, strict=True):
         roots = [np.roots(own[k:, g][::-1]) for g, k in enumerate(first)]
         real = [one[(np.abs(one.imag) < 1e-7) & (one.real > 0) & (one.real < 1)].real for one in roots]
         expected = np.array([np.min(one, initial=np.inf) for one in real])
-        if np.min(expected) > 1 - 1e-6 or np.any(np.abs(np.concatenate(roots).imag) < 1e-5) != any(map(len, real)):
+        every = np.concatenate(roots)
+        nearly = (np.abs(every.imag) < 1e-5) & (every.real > -1e-6) & (every.real < 1 + 1e-6)
+        if np.sum(nearly) > sum(map(len, real)) or np.any(np.abs(every[nearly].real - 1) < 1e-6):
             continue  # a root that hardly is one
         if not np.isfinite(expected).any():
             assert not fired.any() and (ends == 1.0).all()
+            none += 1
             continue
         earliest = np.argmin(expected)
         if not fired[np.argmin(ends)]:  # so far there is no root, but the steps were used up
@@ -275,7 +278,7 @@ def test_the_first_of_several_series_that_begin_at_zero_to_run_out_is_found():
         assert fired[earliest] and ends[earliest] == pytest.approx(expected[earliest], rel=1e-8)
         assert np.min(ends) == ends[earliest]
         found += 1
-    assert found > 200 and given_up < 5
+    assert found > 200 and none > 20 and given_up < 5
 
 
 def test_only_what_ends_the_advance_stops_the_march_along_others():
