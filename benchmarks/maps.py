@@ -92,20 +92,47 @@ def map_() -> None:
 
 
 def speed() -> None:
-    """Maps of two sizes: wall time, that of all cores, and trajectory-cycles (one trajectory over 1/68 s) per second."""
-    for points, calls in ((64, ("first call", "warm", "warm", "warm")), (256, ("warm", "warm"))):
-        for call in calls:
+    """Warm maps of two sizes, a Markdown table: the shortest wall time of three, that of all cores, trajectory-cycles (one trajectory
+    over 1/68 s, until it is decided) per second; and how many times as long hand-written C++ in one thread takes to follow each
+    trajectory for 30 s (`tests/helpers/reference`, from 128 of them over 8 s).
+    """
+    by_hand = _seconds_by_hand(128, 8.0) * 30.0 / 8.0
+    print(
+        "| warm map, μ 0.05–0.228, p 1–4, 3 m/s (`maps speed`) | time | of all cores | trajectory-cycles per second | undecided; how "
+        "far from a boundary in p | hand-written C++ to 30 s takes |"
+    )
+    print("|---|---|---|---|---|---|")
+    for points in (64, 256):
+        paper_map(points)  # compiled
+        taken = []
+        for _ in range(3):
             begin, cores = time.perf_counter(), time.process_time()
             m = paper_map(points)
-            wall, cores = time.perf_counter() - begin, time.process_time() - cores
-            undecided = np.asarray(m["verdict"] < 0)
-            cycles = 68 * np.where(np.isnan(m["decided_at"]), 20.0, m["decided_at"]).sum()
-            print(
-                f"{points} × {points}, {call}: {wall:.1f} s ({cores:.1f} s of cores), {cycles / wall:.2g} trajectory-cycles/s, "
-                f"{cycles / cores:.2g} per core; undecided {undecided.mean():.2%}, "
-                f"farthest from a boundary in p: {_farthest(m, undecided):.1g}",
-                flush=True,
-            )
+            taken.append((time.perf_counter() - begin, time.process_time() - cores))
+        wall, cores = min(taken)
+        undecided = np.asarray(m["verdict"] < 0)
+        cycles = 68 * np.where(np.isnan(m["decided_at"]), 20.0, m["decided_at"]).sum()
+        print(
+            f"| {points} × {points} | {wall:.1f} s | {cores:.1f} s | {cycles / wall:.1e} | {undecided.mean():.2%}; "
+            f"{_farthest(m, undecided):.1g} | {by_hand * points**2 / wall:.0f} times as long |",
+            flush=True,
+        )
+
+
+def _seconds_by_hand(count: int, duration: float) -> float:
+    """The time that the reference takes for one trajectory of the map over so many s, on average over some of them."""
+    from tests.helpers import reference  # not at the top: other studies measure the memory of this process
+
+    draws = np.random.default_rng(30)
+    mu, p = (draws.uniform(*MAP[name], count) for name in ("mu", "p"))
+    scenes = [
+        reference.of_scene(scene(p=float(own)).replace(mu=float(friction))) for friction, own in zip(mu, p, strict=True)
+    ]
+    reference.trajectory(scenes[0], 1.0)  # compiled
+    begin = time.perf_counter()
+    for one in scenes:
+        reference.trajectory(one, duration, (), 4000, 4000)
+    return (time.perf_counter() - begin) / count
 
 
 def refined() -> None:

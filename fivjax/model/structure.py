@@ -7,6 +7,7 @@ A structure holds either its matrices, or the parameters from which they are wor
 cannot disagree.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -79,7 +80,10 @@ class FromParameters(eqx.Module):
                 "The matrices of this structure follow from its parameters. Change these with `replace`, or take "
                 "`structure.as_matrices()` to change a matrix itself."
             )
-        return jax.tree.map(jnp.asarray, _matrices(self.matrices_of, parameters))
+        # Under `jit`, too, known parameters make known matrices, which NumPy takes.
+        now = jax.ensure_compile_time_eval() if is_known(list(parameters.values())) else contextlib.nullcontext()
+        with now:
+            return jax.tree.map(jnp.asarray, _matrices(self.matrices_of, parameters))
 
 
 # Always rounded alike: the same parameters make the same matrices.

@@ -145,6 +145,16 @@ def test_matrices_may_be_traced():
         assert float(jax.grad(stiffness_of)(3.0)) == 2.0
 
 
+def test_known_matrices_are_known_under_jit():
+    structure = fj.belt_oscillator()
+
+    @jax.jit
+    def scaled(x):
+        return x * np.asarray(structure.mass)[0, 0]
+
+    assert np.isclose(float(scaled(2.0)), 2 * float(structure.mass[0, 0]), rtol=1e-6)
+
+
 def test_entries_of_a_list_may_be_traced():
     """A list may hold traced entries: a small matrix written out by hand can be differentiated too."""
 
