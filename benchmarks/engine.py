@@ -112,6 +112,23 @@ def warm() -> None:
             both = jax.jit(jax.value_and_grad(of))
             taken = milliseconds(functools.partial(finished, both, values))
             print(f"| value and gradient of a loss on 1 s, jitted, by {count} parameters | {taken:.2f} ms |")
+        # The entries of three matrices, and three more.
+        structure = scene.structure
+        matrices, direction = (structure.mass, structure.damping, structure.stiffness), structure.load_direction
+
+        def of_matrices(values):
+            added = values[:27].reshape(3, 3, 3)
+            own = (one + 0.5 * (more + more.T) for one, more in zip(matrices, added, strict=True))
+            one = fj.Scene(
+                fj.Structure(*own, direction), fj.Coulomb(values[27]), values[28], fj.Pulse(100.0, values[29])
+            )
+            return (fj.simulate(one, 1.0, 1e-2).velocity ** 2).sum()
+
+        both, values = jax.jit(jax.value_and_grad(of_matrices)), np.array([*np.zeros(27), 0.227, 1.0, 1.2])
+        print(
+            f"| the same by 30 parameters | {milliseconds(functools.partial(finished, both, values)):.2f} ms |",
+            flush=True,
+        )
     searches = {
         "`limit_cycle`, with the neighbourhood that it draws in": lambda: fj.limit_cycle(scene),
         "`saddle_cycle`": lambda: fj.saddle_cycle(scene),
