@@ -76,6 +76,7 @@ WITH_PARAMETERS: dict[str, Callable] = {
 # The same with several results.
 SEVERAL: dict[str, Callable] = {
     "split": lambda a, p: np.split(a, np.cumsum(p["sizes"])[:-1], p["axis"]),
+    "unstack": lambda a, p: list(np.moveaxis(a, p["axis"], 0)),
 }
 # Those of them for which it depends on shapes and types whether there is such a case. (For `gather` it depends on indices.)
 SOME_CASES = ("div", "bitcast_convert_type", "pad", "reduce_max", "reduce_min")

@@ -95,8 +95,9 @@ def matlab(path: str, send) -> None:
     """Send the arrays of a MATLAB file before version 7.3, and the parts of its sparse matrices, as `matlab73` does."""
     from scipy import io, sparse
 
-    # Of two variables with one name, and of a damaged one, the library only warns.
+    # Of two variables with one name, and of a damaged one, the library only warns; and of what it will do in later versions.
     with warnings.catch_warnings(action="error"):
+        warnings.simplefilter("ignore", DeprecationWarning)
         variables = io.loadmat(path, appendmat=False)
     for name in variables:
         if not name.startswith("__"):

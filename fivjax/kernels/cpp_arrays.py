@@ -171,6 +171,12 @@ def split(value: Value, params) -> list[Value]:
     return found
 
 
+def unstacked(value: Value, params) -> list[Value]:
+    axis = params["axis"]
+    each = split(value, {"axis": axis, "sizes": [1] * value.shape[axis]})
+    return [squeezed(one, {"dimensions": (axis,)}) for one in each]
+
+
 def padded(value: np.ndarray, filling: np.ndarray, params) -> np.ndarray:
     """With room before, behind and between its entries; negative room takes entries away."""
     config = params["padding_config"]
@@ -195,6 +201,7 @@ MOVING = {
     "rev": reversed_along,
     "broadcast_in_dim": broadcast_in_dim,
     "split": split,
+    "unstack": unstacked,
 }
 # The same, for small arrays only.
 MOVING_ENTRIES = {

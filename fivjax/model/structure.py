@@ -1,10 +1,8 @@
 """The vibrating structure: symmetric matrices, the direction of the load, and the directions of its contacts.
 
 A structure has no contact forces and no friction. Sliding and sticking are projections of its matrices (`sliding`, `contact`);
-nothing outside `belt_oscillator` depends on the names of springs or angles.
-
-A structure holds either its matrices, or the parameters from which they are worked out each time, never both: so the two
-cannot disagree.
+nothing outside `belt_oscillator` depends on the names of springs or angles. A structure holds either its matrices, or the
+parameters from which they are worked out each time, never both: so the two cannot disagree.
 """
 
 import contextlib
@@ -81,8 +79,8 @@ class FromParameters(eqx.Module):
                 "`structure.as_matrices()` to change a matrix itself."
             )
         # Under `jit`, too, known parameters make known matrices, which NumPy takes.
-        now = jax.ensure_compile_time_eval() if is_known(list(parameters.values())) else contextlib.nullcontext()
-        with now:
+        known = is_known(list(parameters.values()))
+        with jax.ensure_compile_time_eval() if known else contextlib.nullcontext():
             return jax.tree.map(jnp.asarray, _matrices(self.matrices_of, parameters))
 
 
