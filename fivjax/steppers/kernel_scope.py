@@ -2,29 +2,36 @@
 
 import functools
 import warnings
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..contact import Mechanics, status_from_forces
 from ..foundation.argument_forms import Form
 from ..foundation.plain_trees import PACKAGE
 from ..kernels.code import traced_source
 from ..kernels.warp_library import is_installed
+from ..model.belt import belt_oscillator
+from ..model.friction import Coulomb, ExponentialDecay
+from ..model.load import Pulse
 from ..model.scene import Scene
 from .base import AbstractStepper
 from .event_exact import EventExact
 
 # Larger structures and more contacts are left to XLA: their kernels would have more code than they save.
 LARGEST, MOST_CONTACTS = 48, 4
+# The latest version of JAX whose primitives are known to have C++. In a later one it is looked whether a step has.
+LATEST_JAX = (0, 12)
 
 
 def has_kernel(scene: Scene, method: AbstractStepper, called_by_xla: bool = True) -> bool:
     """Whether a kernel follows the motions of such scenes by this method; on a CPU, if programs of XLA may call it."""
     if not isinstance(method, EventExact):
         return False
-    if not is_installed():
-        _tell_once()
+    if (lacking := _lacking()) is not None:
+        _tell_once(*lacking)
         return False
     return (
         (not called_by_xla or jax.default_backend() == "cpu")
@@ -41,13 +48,45 @@ def goes_side_by_side(scene: Scene) -> bool:
     return len(scene.structure.contacts) <= 3
 
 
+def _lacking() -> tuple[str, str] | None:
+    """Why no kernels can be built, and the remedy."""
+    if not is_installed():
+        return "Warp is not installed", "`pip install warp-lang` installs it"
+    if not _steps_can_be_written():
+        major, minor = LATEST_JAX
+        return (
+            f"JAX {jax.__version__} is later than this version knows",
+            f"`pip install 'jax<{major}.{minor + 1}'` installs one that it knows",
+        )
+    return None
+
+
 @functools.cache
-def _tell_once() -> None:
+def _tell_once(reason: str, remedy: str) -> None:
     warnings.warn(
-        "Warp is not installed, so XLA follows motions in place of kernels. Results are the same to rounding, but first calls "
-        "take up to a minute more, and maps some forty times as long. `pip install warp-lang` installs it.",
+        f"{reason}, so XLA follows motions in place of kernels. Results are the same to rounding, but first calls take up to a "
+        f"minute more, and maps some forty times as long. {remedy}.",
         stacklevel=2,
     )
+
+
+@functools.cache
+def _steps_can_be_written() -> bool:
+    """Whether a step can be written as C++: a later version of JAX may trace other primitives."""
+    if jax.__version_info__[:2] <= LATEST_JAX:
+        return True
+    structure, load = belt_oscillator(), Pulse(100.0, 1.2)
+    laws = Coulomb(0.2), ExponentialDecay(0.2, 0.1, 0.5)
+    forms = [Form.of((Scene(structure, law, 1.0, load), np.zeros(2 * structure.size)))[0] for law in laws]
+    return all(_can_be_written(_step, form) for form in forms)
+
+
+def _step(args, instants):
+    scene, y = args
+    mechanics = Mechanics(scene)
+    contact = status_from_forces(mechanics, scene.load.force, y)
+    after = EventExact().advance(mechanics, contact, scene.load.force, y, jnp.asarray(0.1), at_section=True)
+    return (after.y, after.contact.status), ()
 
 
 def _laws_can_be_written(scene: Scene) -> bool:
@@ -57,15 +96,15 @@ def _laws_can_be_written(scene: Scene) -> bool:
         return True
     form, _ = Form.of((*laws, np.zeros(() if count == 1 else count)))
     try:
-        return _can_be_written(form)
+        return _can_be_written(_values, form)
     except TypeError:  # it has fixed fields that cannot be told apart; or it fails, as XLA's trace will say
         return False
 
 
 @functools.cache
-def _can_be_written(form: Form) -> bool:
+def _can_be_written(function: Callable, form: Form) -> bool:
     try:
-        traced_source(_values, form, ())
+        traced_source(function, form, ())
     except NotImplementedError:
         return False
     return True

@@ -70,7 +70,8 @@ def of_many_kinds(x, k):
     count = jax.lax.while_loop(lambda n: n * n < 50 + k, lambda n: n + 1, k)
     chosen = jax.lax.cond(k > 2, lambda row: -row, lambda row: row / 2, table[k])
     solved = solve(jnp.eye(3) * 3 + table[:3] / 9, chosen)
-    return total, rows.at[k, 1].add(x), count * 3, solved, jnp.max(table, axis=1), table[::2].astype(int)
+    columns = jnp.unstack(table, axis=1)
+    return total, rows.at[k, 1].add(x), count * 3, solved, jnp.max(table, axis=1), table[::2].astype(int), columns[2]
 
 
 def test_a_plan_is_text_and_gives_the_same():

@@ -30,6 +30,7 @@ def with_loops(x, matrix, count):
     rows = jax.lax.scan(lambda a, b: (a + b, a * b), jnp.zeros(size), jnp.outer(x, y))[1]
     batch = jnp.einsum("bij,bj->bi", jnp.stack([matrix, matrix.T, 2 * matrix]), rows[:3])
     large = jnp.where(rows > 0, rows, matrix[:, :1] * rows)
+    first, *_, last = jnp.unstack(rows, axis=1)
     taken = jnp.take_along_axis(rows, jnp.argmax(rows, axis=1)[:, None], axis=1)
     return {
         "y": y,
@@ -37,6 +38,7 @@ def with_loops(x, matrix, count):
         "batch": batch.sum(axis=0),
         "large": jnp.max(large, axis=1) + jnp.sum(large.T, axis=1),
         "taken": taken[:, 0],
+        "unstacked": first - 2 * last,
         "sorted": jnp.sort(jnp.stack([far[0], y[0], y[1], far[1]])),
         "count": count + jnp.sum(rows > 0),
     }

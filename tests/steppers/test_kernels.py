@@ -12,7 +12,7 @@ import pytest
 import fivjax as fj
 from fivjax.contact import Mechanics, status_from_forces
 from fivjax.foundation.compiling import compiled
-from fivjax.kernels import functions, warp_library
+from fivjax.kernels import cpp_arrays, functions, warp_library
 from fivjax.kernels import kernel as built
 from fivjax.kernels.warp_library import LEAST_ON_GPUS, gpus_for, warp
 from fivjax.maps.following import Batch, begin_all
@@ -151,6 +151,22 @@ def test_a_map_by_kernels_is_the_map_without_them(paper_scene, monkeypatch, belt
     amplitudes = (one.amplitude.values[cycles] for one in (found, expected))
     np.testing.assert_allclose(*amplitudes, rtol=2e-3)
     assert set(found.verdict.values.tolist()) == verdicts and found.attractor_kind.values.tolist() == kinds
+
+
+def test_a_later_jax_has_kernels_if_they_can_be_written(paper_scene, monkeypatch):
+    """A later version may trace primitives that have no C++ here; then XLA follows, which is said."""
+    monkeypatch.setattr(kernel_scope, "LATEST_JAX", (0, 1))
+    kernel_scope._steps_can_be_written.cache_clear()
+    assert kernel_scope.has_kernel(paper_scene, fj.EventExact())
+    monkeypatch.delitem(cpp_arrays.MOVING, "slice")
+    for cached in (kernel_scope._steps_can_be_written, kernel_scope._can_be_written, kernel_scope._tell_once):
+        cached.cache_clear()
+    with pytest.warns(UserWarning, match=r"JAX .* is later than this version knows.*pip install 'jax<0\.2'"):
+        assert not kernel_scope.has_kernel(paper_scene, fj.EventExact())
+    monkeypatch.undo()
+    for cached in (kernel_scope._steps_can_be_written, kernel_scope._can_be_written):
+        cached.cache_clear()
+    assert kernel_scope.has_kernel(paper_scene, fj.EventExact())
 
 
 def test_a_map_over_masses_by_kernels_is_that_of_each_structure(paper_scene):
