@@ -82,8 +82,9 @@ def continue_cycle(
     - `parameter` (its value), `period` (s), `amplitude` (peak tangential speed, m/s), `stable`;
     - `sliding_stable`, whether steady sliding is stable there;
     - `multipliers` over `multiplier`, largest first, without the one for a deviation along the cycle;
-    - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there, `status` and
-      `direction` (with several contacts over `contact`, too);
+    - `word`, the contact modes in order; `state`, on the section, in m and m/s (just after an impact that makes the tangential
+      velocity jump over zero), and the contact mode there, `status` and the `direction` of friction on the structure, 1 where
+      the belt is faster (with several contacts over `contact`, too);
     - `special`: the kind of a special point, else empty: "fold", "non-smooth fold" (no multiplier is one: an impact begins to
       end the slip there, say), "period doubling", "Neimark–Sacker", "amplitude meets the sliding equilibrium", or how the
       contact modes change there, as seen from the start outwards ("grazing of slip: stick inserted"; with several contacts "…

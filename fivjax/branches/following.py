@@ -10,6 +10,7 @@ from ..foundation.progress import stage
 from ..linear.linearisation import sliding_rates
 from . import halves
 from .branch_points import BranchPoint, branch_point, cycle_beyond, is_real_motion
+from .corners import around_corner
 from .mode_changes import change_of_modes, with_own_rebounds
 from .multiple_shooting import AT_SECTION
 from .pseudo_arclength import ComputedCycle, Curve, Family
@@ -53,7 +54,14 @@ def follow_branch(
         curve = here.curve
         ahead = _ahead(curve, here.cycle, tangent, step)
         if ahead is None:
-            return HalfBranch(points, _at(family, here, "no cycle is found further on, however short the step"))
+            turned = around_corner(family, here, tangent)
+            if turned is None:
+                return HalfBranch(points, _at(family, here, "no cycle is found further on, however short the step"))
+            corner, (here, tangent, step) = turned
+            if corner is not None and bounds[0] <= corner.cycle.parameter <= bounds[1]:
+                points.append(branch_point(family, curve, corner.cycle, corner))
+            points.append(here)
+            continue
         following, turned, step = ahead
         last = branch_point(family, curve, following)
         if not last.is_real:
@@ -130,10 +138,11 @@ def _ahead(
     while True:
         following = curve.along(here, tangent, step)
         if following is not None:
-            turned = curve.tangent(following, tangent)
-            if turned @ tangent >= straight or step <= 1e-3:
+            turned, chord = curve.tangent(following, tangent), float(np.linalg.norm(following.u - here.u))
+            # Parts of a branch that lie beside each other may have the same direction: it is not to be left for another one.
+            if (turned @ tangent >= straight and step >= straight * chord) or (step <= 1e-3 and chord <= 4 * step):
                 return following, turned, step
-        elif step <= 4 * SHORTEST:
+        if step <= 4 * SHORTEST:
             return None
         step *= 0.5
 

@@ -501,6 +501,34 @@ def test_a_change_of_modes_lies_between_its_neighbours():
     assert np.all(np.diff(theta[places[-2] - 1 :]) > 0)
 
 
+def test_a_branch_turns_back_where_an_impact_begins_to_end_the_slip_in_the_same_modes():
+    """Twice: an independent shooting has the corners at these values. The part between lies beside the others, and is not missed."""
+    scene = fj.Scene(
+        fj.belt_oscillator(theta=0.05, k2=97e3), fj.ExponentialDecay(0.3, 0.048464, 1.2), 1.5, fj.ConstantLoad(100.0)
+    )
+    state = [-0.0041756638, 0.0040101764, 0.0051538719, 0.0, -1.44457, -2.600327]
+    branch = fj.continue_cycle(scene, "mu_dynamic", (0.0399, 0.0486), start=fj.limit_cycle(scene, (state, 2)))
+    mu, special = branch["parameter"].values, branch["special"].values
+    corners = np.flatnonzero(special)
+    assert (
+        set(special[corners]) == {"non-smooth fold"}
+        and branch.begins.endswith("reached.")
+        and branch.ends.endswith("reached.")
+    )
+    np.testing.assert_allclose(sorted(mu[corners]), [0.0399876423, 0.0485010356], atol=2e-10)
+    assert len(np.unique(branch["word"].values)) == 1
+    # On the way from one bound to the other the parameter turns back twice.
+    assert np.sum(np.diff(np.sign(np.diff(mu))) != 0) == 2
+    for i in (1, corners[0] + 2, (corners[0] + corners[1]) // 2, corners[1] + 2, len(mu) - 2):
+        model = oracle.paper_model(
+            mu_static=0.3, mu_dynamic=float(mu[i]), decay=1.2, belt_speed=1.5, theta=0.05, k2=97e3
+        )
+        q, v = np.split(branch["state"].values[i], 2)
+        with np.errstate(over="ignore"):  # where its solver looks beyond a step
+            run = oracle.simulate(model, float(branch["period"][i]), y0=(q, v))
+        np.testing.assert_allclose(run.v[-1], v, atol=1e-7 * float(branch["amplitude"][i]))
+
+
 def _share_that_holds_a_reversal(mu: float, end) -> float:
     """|T|/N of the forces that would keep the contact from moving where the slip of a cycle reverses, by the independent solver,
     at a point of a branch over static friction: with a little less of it.
