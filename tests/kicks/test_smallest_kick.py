@@ -39,7 +39,9 @@ PAIR = scene_of(copies(2, shares=[0.5, 1.0]), mu=0.2, belt=0.5, p=1.2)
 
 
 def test_bounds_of_several_contacts_are_those_of_the_one_that_ends_first():
-    assert certified_excess(PAIR, 0.02, 0.1) == pytest.approx(certified_excess(ALONE, 0.02, 0.1), rel=1e-6)
+    pair, alone = (certified_excess(scene, 0.02, 0.1) for scene in (PAIR, ALONE))
+    # Rounding mixes the modes of equal oscillators: sizes that are added instead of numbers make a bound lower, never higher.
+    assert (1 - 1e-5) * alone < pair < (1 + 1e-9) * alone
     for kind in (InitialStates, lambda scene: Histories(scene, 4, 0.02)):
         with jax.enable_x64(True):
             loaded, less, both = (kind(scene).certificate().size for scene in (ALONE, ALONE.replace(force=50.0), PAIR))
