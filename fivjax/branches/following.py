@@ -54,10 +54,10 @@ def follow_branch(
         curve = here.curve
         ahead = _ahead(curve, here.cycle, tangent, step)
         if ahead is None:
-            turned = around_corner(family, here, tangent)
-            if turned is None:
+            beyond = around_corner(family, here, tangent)
+            if beyond is None:
                 return HalfBranch(points, _at(family, here, "no cycle is found further on, however short the step"))
-            corner, (here, tangent, step) = turned
+            corner, (here, tangent, step) = beyond
             if corner is not None and bounds[0] <= corner.cycle.parameter <= bounds[1]:
                 points.append(branch_point(family, curve, corner.cycle, corner))
             points.append(here)
