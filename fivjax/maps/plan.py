@@ -198,8 +198,6 @@ def cut_into_jobs(unit: Int[np.ndarray, " r"], places: Indices, most: int) -> li
 # once takes less of Python.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
 TIMES_AS_LARGE, JOBS = 8, 8
-# A run of more has two jobs at least: in a single one, a core often waits for the other while attractors are sought.
-IN_ONE_JOB = 2048
 # The most groups of a job, for the same reason: most of the work on a small group are its attractors.
 GROUPS_IN_A_JOB = 512
 
@@ -226,8 +224,7 @@ def plan_of(
     per_group = trajectories.total / trajectories.group_count
     each = bytes_per_trajectory(scene, per_group)
     count = trajectories.total if places is None else len(places)
-    most = largest_job_size(takes_long(scene, method, limits.energy), each, per_group, count)
-    jobs = trajectories.jobs(places, min(most, max(-(-count // 2), IN_ONE_JOB)))
+    jobs = trajectories.jobs(places, largest_job_size(takes_long(scene, method, limits.energy), each, per_group, count))
     every = np.arange(trajectories.group_count) if places is None else np.unique(trajectories.groups(places))
     counts, later = np.zeros(len(every), np.int64), []
     for number, own in enumerate(jobs):
