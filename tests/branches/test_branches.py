@@ -501,13 +501,15 @@ def test_a_change_of_modes_lies_between_its_neighbours():
     assert np.all(np.diff(theta[places[-2] - 1 :]) > 0)
 
 
+CORNERED = fj.Scene(
+    fj.belt_oscillator(theta=0.05, k2=97e3), fj.ExponentialDecay(0.3, 0.048464, 1.2), 1.5, fj.ConstantLoad(100.0)
+)
+NEAR_A_CORNER = [-0.0041756638, 0.0040101764, 0.0051538719, 0.0, -1.44457, -2.600327], 2
+
+
 def test_a_branch_turns_back_where_an_impact_begins_to_end_the_slip_in_the_same_modes():
     """Twice: an independent shooting has the corners at these values. The part between lies beside the others, and is not missed."""
-    scene = fj.Scene(
-        fj.belt_oscillator(theta=0.05, k2=97e3), fj.ExponentialDecay(0.3, 0.048464, 1.2), 1.5, fj.ConstantLoad(100.0)
-    )
-    state = [-0.0041756638, 0.0040101764, 0.0051538719, 0.0, -1.44457, -2.600327]
-    branch = fj.continue_cycle(scene, "mu_dynamic", (0.0399, 0.0486), start=fj.limit_cycle(scene, (state, 2)))
+    branch = fj.continue_cycle(CORNERED, "mu_dynamic", (0.0399, 0.0486), start=fj.limit_cycle(CORNERED, NEAR_A_CORNER))
     mu, special = branch["parameter"].values, branch["special"].values
     corners = np.flatnonzero(special)
     assert (
@@ -527,6 +529,18 @@ def test_a_branch_turns_back_where_an_impact_begins_to_end_the_slip_in_the_same_
         with np.errstate(over="ignore"):  # where its solver looks beyond a step
             run = oracle.simulate(model, float(branch["period"][i]), y0=(q, v))
         np.testing.assert_allclose(run.v[-1], v, atol=1e-7 * float(branch["amplitude"][i]))
+
+
+def test_a_branch_over_the_belts_speed_has_the_corner_of_one_over_friction():
+    """There the belt's speed, at which the slip ends, changes along the branch."""
+    over_speed = fj.continue_cycle(CORNERED, "belt_speed", (1.45, 1.52), fj.limit_cycle(CORNERED, NEAR_A_CORNER))
+    (corner,) = np.flatnonzero(over_speed["special"] == "non-smooth fold")
+    speed, start = float(over_speed["parameter"][corner + 1]), fj.cycle_at(over_speed, int(corner) + 1)
+    over_friction = fj.continue_cycle(CORNERED.replace(belt_speed=speed), "mu_dynamic", (0.044, 0.053), start)
+    (mu,) = over_friction["parameter"].values[over_friction["special"] == "non-smooth fold"]
+    assert speed == pytest.approx(float(over_speed["parameter"][corner]), abs=1e-6) and mu == pytest.approx(
+        0.048464, abs=1e-7
+    )
 
 
 def _share_that_holds_a_reversal(mu: float, end) -> float:
