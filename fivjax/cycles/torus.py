@@ -19,7 +19,7 @@ from ..attractors.tori import Torus
 from ..contact import Contact
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
-from ..section.return_maps import ReturnMaps, Section, section_at
+from ..section.return_maps import ReturnMaps, section_at
 from ..steppers.event_exact import EventExact
 from .cycle import LimitCycle, under_final_load
 from .one_period import follow_period, word
@@ -35,7 +35,7 @@ def limit_cycle_of_torus(maps: ReturnMaps, scene: Scene, torus: Torus) -> LimitC
     start = maps.returns(only, start, 1).at
     found = maps.returns(only, start, POINTS, POINTS)
     points, rotation, residual = _curve(weights, found.path[0])
-    exponents = _lyapunov_exponents(maps, start)
+    exponents = _lyapunov_exponents(maps, found.path[0])
     point = start.point(0)
     seen = follow_period(scene, EventExact(), point, float(maps.returns(only, start, WINDOW).time[0]))
     largest = np.exp(exponents).astype(complex)
@@ -120,16 +120,20 @@ def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
     return float(guess)
 
 
-def _lyapunov_exponents(maps: ReturnMaps, start: Section) -> Float[np.ndarray, " m"]:
-    """Exponents of the return map along a trajectory, largest first, per return."""
+def _lyapunov_exponents(maps: ReturnMaps, path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]:
+    """Exponents of the return map along the first of these states, one return apart; largest first, per return.
+
+    A direction that one of the returns takes away, as a contact that sticks does, has the exponent $-∞$.
+    """
     # Returns over which Lyapunov exponents are computed; the first of them align the basis of deviations, and are left out.
     exponent_returns, aligning = 384, 64
-    weights, basis, logs, at = maps.weights, np.eye(len(maps.weights)), [], [start]
-    for _ in range(exponent_returns - 1):
-        at.append(maps.returns(np.zeros(1, int), at[-1], 1).at)
-    along = Section(*(np.concatenate(parts) for parts in zip(*at, strict=True)))
-    _, _, derived = maps.derived(np.zeros(exponent_returns, int), along, 1)
+    # What is left of a direction that is taken away is rounding.
+    rounding = 1e-12
+    weights, basis, logs, group = maps.weights, np.eye(len(maps.weights)), [], np.zeros(exponent_returns, int)
+    along = section_at(path[:exponent_returns], maps.normal, maps.sliding[group])
+    _, _, derived = maps.derived(group, along, 1)
     for jacobian in derived:
         basis, upper = np.linalg.qr((weights[:, None] * jacobian / weights) @ basis)
-        logs.append(np.log(np.maximum(np.abs(np.diag(upper)), 1e-300)))
+        kept = np.abs(np.diag(upper))
+        logs.append(np.log(kept, out=np.full(len(kept), -np.inf), where=kept > rounding))
     return np.sort(np.mean(logs[aligning:], axis=0))[::-1][:4]
