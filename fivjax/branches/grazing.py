@@ -132,22 +132,24 @@ def _static_edges(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
 
 
 def images_up_to_minimum(
-    curve: Curve, parameter: float, phases: Phases, minimum: GuardMinimum, direction=None
+    curve: Curve, parameter: float, phases: Phases, minimum: GuardMinimum
 ) -> tuple[PhaseImages, PhaseImages]:
     """Images of all phases, and of the phase with the minimum up to its instant."""
-    family, k = curve.family, minimum.phase
-    partial, time = minimum.mode, phases.h[k] if minimum.at_end else minimum.time
-    modes = (*phases.modes, partial)
-    following = (*phases.modes[1:], phases.modes[0], partial)
-    found = images_of_phases(
-        family.at(parameter),
-        family.direction if direction is None else direction,
-        family.stepper,
-        modes,
-        following,
-        np.concatenate([phases.y, phases.y[k : k + 1]]),
-        np.append(phases.h, time),
-    )
+    family = curve.family
+    found = images_of_phases(family.at(parameter), family.direction, family.stepper, *up_to_minimum(phases, minimum))
+    return without_minimum(found)
+
+
+def up_to_minimum(phases: Phases, minimum: GuardMinimum):
+    """All phases and, behind them, that with the minimum up to its instant: modes, those that follow, states, durations."""
+    k, partial, modes = minimum.phase, minimum.mode, phases.modes
+    time = phases.h[k] if minimum.at_end else minimum.time
+    y, h = np.concatenate([phases.y, phases.y[k : k + 1]]), np.append(phases.h, time)
+    return (*modes, partial), (*modes[1:], modes[0], partial), y, h
+
+
+def without_minimum(found: PhaseImages) -> tuple[PhaseImages, PhaseImages]:
+    """Images of the phases themselves, and that of the phase behind them."""
     return PhaseImages(*(part[:-1] for part in found)), PhaseImages(*(part[-1:] for part in found))
 
 

@@ -11,6 +11,7 @@ positive, and for negative times. So the equations have solutions beyond a grazi
 and the grazing is a simple root, which Newton's method finds to rounding.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -183,22 +184,34 @@ def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) 
 
 def images_of_phases(scene: Scene, direction: Scene, stepper: EventExact, modes, following, y, h) -> PhaseImages:
     """`images` of single phases, each with the mode that follows it."""
+    (found,) = images_along(scene, [direction], stepper, modes, following, y, h)
+    return found
+
+
+def images_along(
+    scene: Scene, directions: Sequence[Scene], stepper: EventExact, modes, following, y, h
+) -> list[PhaseImages]:
+    """The same along each of several directions of the parameters, by one kernel for all of them."""
     by_kernel, count = has_kernel(scene, stepper), len(modes)
     ends = Ends(_contacts(modes), np.array([mode.ending for mode in modes], np.int32), _contacts(following))
     own = _filled((np.asarray(y, float), np.asarray(h, float), ends), by_kernel)
     size = own[0].shape[1]
-    # Directions of the derivatives: those of the state, the duration, the parameter.
-    args = ByMethod(stepper), scene
-    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), size + 2)), (*args, *_first(own)))
-    of_parameter = jax.tree.map(lambda leaf: np.asarray(leaf, float)[..., None] * np.eye(size + 2)[-1], direction)
-    units = np.eye(size + 2)
-    directions = still[0], of_parameter, units[:size], units[size], still[4]
-    found = _image.derived(args, directions, own=own, by_kernel=by_kernel)
+    # Directions of the derivatives: those of the state, the duration, the parameters.
+    total = size + 1 + len(directions)
+    args, units = (ByMethod(stepper), scene), np.eye(total)
+    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), total)), (*args, *_first(own)))
+    none = jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)), directions[0])
+    of_parameters = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *[none] * (size + 1), *directions)
+    along = still[0], of_parameters, units[:size], units[size], still[4]
+    found = _image.derived(args, along, own=own, by_kernel=by_kernel)
     ((y, guard), _), ((to, of_guard), _) = found
-    parts = y, guard, to[..., :size], to[..., size], to[..., size + 1]
-    return PhaseImages(
-        *(part[:count] for part in (*parts, of_guard[:, :size], of_guard[:, size], of_guard[:, size + 1]))
-    )
+
+    def of_one(column: int) -> PhaseImages:
+        parts = y, guard, to[..., :size], to[..., size], to[..., column]
+        parts = *parts, of_guard[:, :size], of_guard[:, size], of_guard[:, column]
+        return PhaseImages(*(part[:count] for part in parts))
+
+    return list(map(of_one, range(size + 1, total)))
 
 
 class Ends(NamedTuple):

@@ -15,8 +15,8 @@ from ..linear.linearisation import sliding_rates
 from ..model.directions import direction_of, moved_along
 from ..model.scene import Scene
 from .branch_points import BranchPoint
-from .grazing import images_up_to_minimum, row_of
-from .multiple_shooting import images
+from .grazing import images_up_to_minimum, row_of, up_to_minimum, without_minimum
+from .multiple_shooting import PhaseImages, images_along
 from .pseudo_arclength import Curve, Family, assembled, multipliers_of
 from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
@@ -34,19 +34,33 @@ def derivatives_of_special_points(
     values = np.full((len(points), len(names)), np.nan)
     for row, point in enumerate(points):
         if point.special is not None:
-            for column, name in enumerate(names):
-                values[row, column] = _derivative(family, point.special, name)
+            values[row] = _derivatives(family, point.special, names)
     return names, values
 
 
-def _derivative(family: Family, special: Special, name: str) -> float:
-    curve, cycle = special.curve, special.cycle
+def _derivatives(family: Family, special: Special, names: list[str]) -> list[float]:
+    cycle, phases = special.cycle, special.cycle.phases
     if special.name == MEETS_SLIDING:
-        return _of_stability_limit(family, cycle.parameter, name)
+        return [_of_stability_limit(family, cycle.parameter, name) for name in names]
+    directions = [direction_of(family.scene, name) for name in names]
+    asked = (
+        (phases.modes, phases.modes[1:] + phases.modes[:1], phases.y, phases.h)
+        if special.grazing is None
+        else up_to_minimum(phases, special.grazing.minimum)
+    )
+    found = images_along(family.at(cycle.parameter), directions, family.stepper, *asked)
+    return [_derivative(family, special, *each) for each in zip(names, directions, found, strict=True)]
+
+
+def _derivative(family: Family, special: Special, name: str, direction: Scene, found: PhaseImages) -> float:
+    """From the images of phases along the direction, of which the last is up to the minimum that grazes, if one does."""
+    curve, cycle = special.curve, special.cycle
     if name == "restitution" and _is_inelastic(family) and _rebounds_change(special):
         return np.nan
-    direction = direction_of(family.scene, name)
-    found = images(family.at(cycle.parameter), direction, family.stepper, cycle.phases)
+    last = 0.0
+    if special.grazing is not None:
+        found, partial = without_minimum(found)
+        last = float(partial.guard_parameter[0])
     _, rows = assembled(found, cycle.phases)
     _, own = assembled(cycle.images, cycle.phases)
     slope, own = rows[:, -1], own * curve.scales
@@ -58,11 +72,9 @@ def _derivative(family: Family, special: Special, name: str) -> float:
         return _of_multiplier(family, special, name, direction, own, slope)
     if special.row is None:
         return np.nan
-    last, row = 0.0, special.row
+    row = special.row
     if special.grazing is not None:
-        _, partial = images_up_to_minimum(curve, cycle.parameter, cycle.phases, special.grazing.minimum, direction)
         _, itself = images_up_to_minimum(curve, cycle.parameter, cycle.phases, special.grazing.minimum)
-        last = float(partial.guard_parameter[0])
         row = row_of(curve, cycle.phases, special.grazing.minimum, itself)
     system = np.vstack([own, row])
     sizes = np.max(np.abs(system), axis=1)
