@@ -201,7 +201,7 @@ class LimitCycle(eqx.Module):
         size = f"{self.frequency:.6g} Hz, peak tangential speed {self.amplitude:.6g} m/s"
         head = f"limit cycle ({self.kind}, {stability}): {size}"
         if self.kind == "torus":
-            exponents = ", ".join(f"{np.log(abs(value)):.2g}" for value in self.multipliers[:4])
+            exponents = ", ".join(f"{np.log(abs(value)):.2g}" if value else "-∞" for value in self.multipliers[:4])
             curve = (
                 "" if self.rotation_number is None else f"; its points lie on one up to {self.residual:.1e} of its size"
             )

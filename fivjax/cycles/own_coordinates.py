@@ -104,8 +104,8 @@ def _outside(scene: Scene, found) -> Any:
     if hasattr(found, "attrs"):
         return _dataset_outside(scene, found)
     turned = functools.partial(from_contact_coordinates, scene.structure)
-    if hasattr(found, "in_coordinates"):
-        return found.in_coordinates(turned)
+    if hasattr(found, "in_scene"):
+        return found.in_scene(scene, turned)
     # A cycle nearby has a state; what else there is has no coordinates.
     if isinstance(found, eqx.Module) and hasattr(found, "state"):
         return dataclasses.replace(found, state=turned(found.state))

@@ -95,6 +95,7 @@ QUANTITIES = {
     "status_before": ("contact status before (0 stick, 1 slide, 2 detach)", "1"),
     "status_after": ("contact status after (0 stick, 1 slide, 2 detach)", "1"),
     "p_crit": ("critical perturbation", "1"),
+    "p_certified": ("perturbation below which every kick is proved to slide", "1"),
     "p_crit_low": ("largest perturbation proved to return to sliding below the crossing", "1"),
     "p_crit_high": ("smallest perturbation proved to end on a limit cycle above the crossing", "1"),
     "p_crit_error": ("error estimate of the critical perturbation", "1"),

@@ -9,8 +9,8 @@ $P(d)$, over all durations, slides for ever. Between two durations $h$ apart, $P
 with $L$ a bound on the derivative.
 """
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple, overload
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +29,11 @@ from ..section.about_sliding import weights_of
 from ..verdicts.sliding_proof import envelope_peak
 from .critical import critical_perturbation
 from .perturbations import stable_sliding
-from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, smallest_history, smallest_state
+from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, dataset_of, smallest_history, smallest_state
 from .stable_manifold import Saddle, critical_kick, saddle_of
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Number of durations at which the bound is evaluated, and of those tried as starts of the search.
 GRID, STARTS = 4096, 24
@@ -53,6 +56,21 @@ class SmallestKick(NamedTuple):
     certified: float  # every kick with p between 1 and this slides for ever, for all durations within the bounds
     proved_low: float  # a kick of the same duration with this p was proved to slide,
     proved_high: float  # and one with this p to end on a limit cycle
+    scene: Scene | None = None  # the one that was asked about
+
+    def in_scene(self, scene: Scene, turned: Callable[[np.ndarray], np.ndarray]) -> "SmallestKick":
+        """The same of a scene in other coordinates."""
+        del turned
+        return self._replace(scene=scene)
+
+    def to_dataset(self) -> "xr.Dataset":
+        """The kick and the bounds with names, units and the scene.
+
+        **Raises:** `ValueError` for one without a scene.
+        """
+        values = {"p_crit": self.p, "p_crit_low": self.proved_low, "p_crit_high": self.proved_high}
+        values |= {"duration": self.duration, "p_certified": self.certified}
+        return dataset_of(values, self.scene)
 
     @property
     def ratio(self) -> float:
@@ -189,7 +207,7 @@ def smallest_kick(
         row, p = at, float(at["p_crit"])
     else:
         duration, p = float(starts[best]), float(row["p_crit"])
-    return SmallestKick(p, duration, certified, float(row["p_crit_low"]), float(row["p_crit_high"]))
+    return SmallestKick(p, duration, certified, float(row["p_crit_low"]), float(row["p_crit_high"]), scene)
 
 
 def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], pieces: int) -> SmallestPerturbation:

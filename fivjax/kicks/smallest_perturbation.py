@@ -7,16 +7,20 @@ sliding suggests.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..attractors.catalogue import Attractors
+from ..io.datasets import labelled
 from ..maps.basin_map import verdicts_from
 from ..maps.crossing import FirstCrossing, first_crossings, with_ends
 from ..model.scene import Scene
 from .perturbations import Histories, InitialStates, Perturbation, Vectors
 from .stable_manifold import Saddle, manifold_normal
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # The largest size scanned along a ray at first, relative to the certified bound, and the number of sizes; later the number of
 # sizes around the last crossing; and the number inside a bracket.
@@ -47,10 +51,35 @@ class SmallestPerturbation(NamedTuple):
     proved_high: float  # and with this size to end on a limit cycle
     values: np.ndarray  # displacements (m) and velocities (m/s), the `y0` of `simulate`; or the factor p of each piece
     trajectories: int  # the number that the search took
+    scene: Scene | None = None  # the one that was asked about
 
-    def in_coordinates(self, turned: Callable[[np.ndarray], np.ndarray]) -> "SmallestPerturbation":
-        """The same with its state, if it is one, in other coordinates."""
-        return self._replace(values=turned(self.values)) if self.over == "state" else self
+    def in_scene(self, scene: Scene, turned: Callable[[np.ndarray], np.ndarray]) -> "SmallestPerturbation":
+        """The same of a scene in other coordinates, with its state, if it is one, turned to them."""
+        values = turned(self.values) if self.over == "state" else self.values
+        return self._replace(scene=scene, values=values)
+
+    def to_dataset(self) -> "xr.Dataset":
+        """The sizes and the state over `coordinate`, or the p of each `piece`, with names, units and the scene.
+
+        **Raises:** `ValueError` for one without a scene.
+        """
+        if self.over == "state":
+            displacement, velocity = np.split(np.asarray(self.values), 2)
+            values = {"displacement": ("coordinate", displacement), "velocity": ("coordinate", velocity)}
+        else:
+            values = {"p": ("piece", np.asarray(self.values))}
+        unit, meanings = (
+            "sqrt(J)" if self.over == "state" else "1",
+            (
+                ("size", "smallest size found that leads to a limit cycle"),
+                ("certified", "size below which everything slides for ever"),
+                ("proved_low", "size of the same shape that was proved to slide"),
+                ("proved_high", "size of the same shape that was proved to end on a limit cycle"),
+            ),
+        )
+        for name, meaning in meanings:
+            values[name] = ((), getattr(self, name), {"units": unit, "long_name": meaning})
+        return dataset_of(values, self.scene, over=self.over).assign_attrs(trajectories=self.trajectories)
 
     @property
     def ratio(self) -> float:
@@ -67,6 +96,20 @@ class SmallestPerturbation(NamedTuple):
         return f"{found}\n{bound}\ngap: the bound is {100 * self.ratio:.3g} % of what was found, as a norm"
 
     __repr__ = __str__
+
+
+def dataset_of(values: dict, scene: Scene | None, **settings) -> "xr.Dataset":
+    """Values by name as a dataset of the scene; those over `coordinate` are of its coordinates."""
+    import xarray as xr
+
+    if scene is None:
+        raise ValueError(
+            "This result has no scene, so it cannot be saved with it. Take one that `smallest_kick` has found."
+        )
+    dataset = xr.Dataset(values)
+    if "coordinate" in dataset.dims:
+        dataset = dataset.assign_coords(coordinate=list(scene.structure.coordinates))
+    return labelled(dataset, scene, **settings)
 
 
 class NoSquealingKick(ValueError):
@@ -162,4 +205,4 @@ def _smallest(scene: Scene, over: str, kind: Perturbation, most: float) -> Small
     if np.isfinite(ends.low[0]):
         low, high = float(ends.low[0]), float(ends.high[0])
     values = rays.rest + kind.states(high * shape[None])[0] if over == "state" else 1.0 + high * shape
-    return SmallestPerturbation(over, high, certificate.size, low, high, values, rays.trajectories)
+    return SmallestPerturbation(over, high, certificate.size, low, high, values, rays.trajectories, scene)

@@ -138,10 +138,39 @@ def test_the_smallest_state_is_given_in_the_structure_s_own_coordinates(monkeypa
 
     monkeypatch.setattr("fivjax.kicks.smallest.smallest_state", found)
     scene = fj.Scene(turned, SCENE.friction, SCENE.belt_speed, SCENE.load)
-    y = fj.smallest_kick(scene, over="state").values
+    smallest = fj.smallest_kick(scene, over="state")
+    y = smallest.values
     assert inside[0].structure.contacts_at_coordinates
     np.testing.assert_allclose(y[:3], fj.sliding_equilibrium(scene), rtol=1e-9)
     assert TURN[0] @ y[3:] == pytest.approx(0.1) and TURN[2] @ y[3:] == pytest.approx(0.0, abs=1e-12)
+    # It carries the caller's scene, not the one that it was computed in.
+    assert smallest.scene.parameters.keys() == scene.parameters.keys()
+    np.testing.assert_array_equal(smallest.to_dataset()["velocity"], y[3:])
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        fj.SmallestKick(1.5, 0.1, 1.25, 1.49, 1.51, SCENE),
+        smallest_perturbation.SmallestPerturbation("state", 2.0, 1.0, 1.9, 2.0, np.arange(6.0), 40, SCENE),
+        smallest_perturbation.SmallestPerturbation("history", 0.2, 0.1, 0.19, 0.2, np.array([1.0, 1.2]), 40, SCENE),
+    ],
+)
+def test_what_was_found_is_saved_with_units_and_its_scene(found, tmp_path):
+    opened = fj.open(fj.save(found, tmp_path / "smallest.nc"))
+    assert fj.Scene.from_dataset(opened).parameters == SCENE.parameters
+    assert all("units" in variable.attrs for variable in opened.data_vars.values())
+    if isinstance(found, fj.SmallestKick):
+        assert float(opened["p_crit"]) == 1.5 and float(opened["p_certified"]) == 1.25
+        return
+    assert float(opened["certified"]) == found.certified and opened.attrs["trajectories"] == 40
+    if opened.sizes.get("piece"):
+        np.testing.assert_array_equal(opened["p"], found.values)
+    else:
+        assert opened["coordinate"].values.tolist() == ["x2", "y1", "y2"]
+        np.testing.assert_array_equal(np.append(opened["displacement"], opened["velocity"]), found.values)
+    with pytest.raises(ValueError, match="no scene"):
+        fj.save(found._replace(scene=None), tmp_path / "none.nc")
 
 
 def test_states_and_histories_are_refused_what_they_do_not_have():
