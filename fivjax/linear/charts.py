@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation.kept_programs import kept
-from ..foundation.linear_solve import solve
 from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, real
 from ..io.datasets import check_axis_names, labelled
 from ..model.scene import Scene
 from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_rows
 from ..model.structure import Structure
-from .linearisation import linear_sliding, slope_damping, tangential_corner, time_scale
+from .linearisation import slope_damping, tangential_corner, time_scale
 from .polynomials import characteristic_polynomial, determinant, polynomial_roots
 from .routh_hurwitz import LARGEST_EXPANDED, hurwitz_determinants
 from .several_contacts import one_contact, sliding_motion
@@ -89,13 +88,13 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
 def _chart(scene, names, columns):
     def polynomial(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))
-        normal_force, exists = _steady_state(point)
+        normal_force = _normal_force(point)
         friction = jnp.sign(point.belt_speed) * point.friction(jnp.abs(point.belt_speed))
         mass, damping, stiffness = sliding_matrices(point.structure, friction)
         damping = damping + slope_damping(point, normal_force) * tangential_corner(point.structure)
         scale = time_scale(point.structure)
         coefficients = characteristic_polynomial(mass, damping, stiffness, scale)
-        ok = exists & (mass[0, 0] > 0)
+        ok = _slides(point, normal_force) & (mass[0, 0] > 0)
         smallest = jnp.min(jnp.stack(hurwitz_determinants(coefficients)))
         return [jnp.where(ok, c, jnp.nan) for c in coefficients], scale, jnp.where(ok, smallest, jnp.nan), normal_force
 
@@ -109,17 +108,12 @@ def _chart(scene, names, columns):
 
     def by_eigenvalues(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))
-        if one_contact(point.structure):
-            normal_force, exists = _steady_state(point)
-            matrix = linear_sliding(point).matrix
-        else:
-            matrix, forces = sliding_motion(point)
-            normal_force, exists = jnp.min(forces), _slides(point, forces)
-        ok = exists & jnp.all(jnp.isfinite(matrix))
+        matrix, forces = sliding_motion(point)
+        ok = _slides(point, forces) & jnp.all(jnp.isfinite(matrix))
         roots = eigenvalues(jnp.where(ok, matrix, jnp.eye(matrix.shape[0])))
         fastest = jnp.argmax(roots.real)
         results = roots.real[fastest], jnp.abs(roots.imag[fastest]) / (2 * jnp.pi), jnp.nan
-        return *(jnp.where(ok, r, jnp.nan) for r in results), normal_force
+        return *(jnp.where(ok, r, jnp.nan) for r in results), jnp.min(forces)
 
     if _is_expanded(scene.structure):
         return jax.lax.map(by_polynomial, tuple(columns))
@@ -131,8 +125,8 @@ def _is_expanded(structure: Structure) -> bool:
     return one_contact(structure) and structure.size - 1 <= LARGEST_EXPANDED
 
 
-def _steady_state(scene: Scene):
-    """Normal force (N) of steady sliding, by sums and products only, and whether there is such a state."""
+def _normal_force(scene: Scene):
+    """That of steady sliding in N, by sums and products only, for few coordinates."""
     structure = scene.structure
     speed = jnp.abs(scene.belt_speed)
     n, keep = structure.normal, sliding_coordinates(structure.size, structure.normal)
@@ -141,16 +135,9 @@ def _steady_state(scene: Scene):
     table = jnp.concatenate([structure.stiffness, structure.load_direction[:, None]], axis=1)
     rows = sliding_rows(structure, table, friction)
     columns = [*keep, structure.size]
-    if len(keep) <= LARGEST_EXPANDED:
-        stiffness = determinant([[[row[j]] for j in keep] for row in rows])[0][0]
-        bordered = determinant([[[row[j]] for j in columns] for row in [*rows, table[n]]])[0][0]
-    else:
-        stiffness, bordered = 1.0, None
-        reduced = rows[:, np.array(columns)]
-        solved = solve(reduced[:, :-1], reduced[:, -1])
-        bordered = table[n, -1] - table[n, keep] @ solved
-    normal_force = -bordered / stiffness * scene.load.final
-    return normal_force, _slides(scene, normal_force)
+    stiffness = determinant([[[row[j]] for j in keep] for row in rows])[0][0]
+    bordered = determinant([[[row[j]] for j in columns] for row in [*rows, table[n]]])[0][0]
+    return -bordered / stiffness * scene.load.final
 
 
 def _slides(scene: Scene, normal_forces):
