@@ -129,6 +129,8 @@ def _abstract(dots, instants, *arrays, kernel: _Hashed):
 def _known(dots, instants, *arrays, kernel: _Hashed):
     dots, instants, *arrays = map(np.asarray, (dots, instants, *arrays))
     batch = _batch_of(kernel, arrays)
+    if 0 in batch:
+        return [jax.device_put(np.zeros(shape)) for shape in kernel.kernel.shapes(batch, instants.shape[-1])]
     found = kernel.kernel.launched(
         _in_rows(arrays, math.prod(batch), np), instants.reshape(-1, instants.shape[-1]), dots[None]
     )
@@ -206,6 +208,8 @@ def _arrays(like: Sequence[Array], numbers) -> list:
 def _lowered(dots, instants, *arrays, kernel: _Hashed):
     batch = _batch_of(kernel, arrays)
     shapes, lanes = kernel.kernel.shapes(batch, instants.shape[-1]), math.prod(batch)
+    if not lanes:
+        return list(map(jnp.zeros, shapes))
     flat = _in_rows(arrays, lanes, jnp), dots[None], instants.reshape(-1, instants.shape[-1])
     of_lanes = [jax.ShapeDtypeStruct((lanes, *shape[len(batch) :]), np.float64) for shape in shapes]
     found = _callable(kernel)(of_lanes)(*flat)

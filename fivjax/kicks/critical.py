@@ -28,6 +28,8 @@ from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
 from .critical_derivatives import differentiable, with_derivatives
 
+# The steps of a scan, unless given.
+P_STEP = 0.01
 # Names in the dataset of critical kicks, beside those of maps.
 OF_RESULTS = (
     *("p_crit_low", "p_crit_high", "p_crit_error", "crossings", "only_crossing", "critical_energy", "kick_work"),
@@ -43,7 +45,7 @@ def critical_perturbation(
     scene: Scene,
     *,
     p_range: tuple[float, float] = (1.0, 5.0),
-    p_step: float = 0.01,
+    p_step: float | None = None,
     tolerance: float = 1e-5,
     method: AbstractStepper | None = None,
     t_max: float | None = None,
@@ -66,7 +68,7 @@ def critical_perturbation(
 
     - `scene`: a scene whose load is a `Pulse`.
     - `**axis`: values of any numeric parameters but p, by name.
-    - `p_range`, `p_step`: the range of p, and the steps of the scan.
+    - `p_range`, `p_step`: the range of p, and the steps of the scan: 0.01 unless given, or the range if that is narrower.
     - `tolerance`: the width of the bracket at which narrowing stops.
     - `method`, `t_max`, `memory`, `progress`, `executor`: as in `bistability_map`.
     - `energy`: whether to add the energies of the critical kick.
@@ -95,7 +97,8 @@ def critical_perturbation(
     - `d_p_crit` over `parameter`, per unit of each; NaN if there is no derivative, and `why_none` says why in a sentence;
     - `newton_trajectories`: the number of trajectories that Newton's method took.
 
-    **Raises:** `ValueError` as `bistability_map`, and for an axis named p; `TypeError` for a load without a pulse.
+    **Raises:** `ValueError` as `bistability_map`, and for an axis named p; `TypeError` for a load without a pulse;
+    `KeyboardInterrupt` where it is interrupted, because kicks that were not run would count as kicks that slide.
 
     **Example:**
 
@@ -124,6 +127,8 @@ def critical_perturbation(
     low, high = p_range
     arguments.real_number("p_range[0]", low, minimum=0)
     arguments.real_number("p_range[1]", high, above=low)
+    if p_step is None:
+        p_step = min(P_STEP, float(high) - float(low))
     arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
     arguments.real_number("tolerance", tolerance, above=0)
     scanned = round(min((high - low) / p_step, 1e15)) + 1
@@ -139,7 +144,7 @@ def critical_perturbation(
 
     def run(values, method, label: str, limits: Limits | None = None):
         limits = Limits(t_max) if limits is None else limits
-        options = RunOptions(label, memory, progress, executor)
+        options = RunOptions(label, memory, progress, executor, all_or_none=True)
         return run_to_verdict(scene, TrajectoryList(values), method, limits, options, attractors=known)
 
     scan = np.linspace(low, high, scanned)

@@ -281,8 +281,10 @@ def _boundary(scene: Scene, exact: AbstractStepper, p) -> Callable[[AbstractStep
         if not np.isfinite(p_crit):
             return shares
         near = (max(0.0, p_crit - 0.05), p_crit + 0.05)
+        # A weak cycle may take longer to draw a motion in; but with steps of one size that takes minutes.
+        t_max = None if isinstance(method, EventExact) else 10.0
         own = critical_perturbation(
-            scene, **now, p_range=near, p_step=0.01, tolerance=1e-5, method=method, t_max=10.0, progress=False
+            scene, **now, p_range=near, p_step=0.01, tolerance=1e-5, method=method, t_max=t_max, progress=False
         )
         return {**shares, "p_crit_error": abs(float(own["p_crit"][0]) - p_crit)}
 

@@ -42,7 +42,7 @@ def verdicts_from(
     """
     places = state_places(scene.structure)
     values = {name: np.ascontiguousarray(states[:, place]) for name, place in places.items()}
-    scene, options = under_final_load(scene), RunOptions(label, progress=False)
+    scene, options = under_final_load(scene), RunOptions(label, progress=False, all_or_none=True)
     listed = TrajectoryList(values, places)
     return run_to_verdict(scene, listed, EventExact(), Limits(30.0), options, attractors=attractors).verdict
 

@@ -59,6 +59,8 @@ class RunOptions(NamedTuple):
     executor: Workers | None = None  # runs the jobs; unless given, threads of this process do
     # Gets the results of each job, and has those of an earlier run. A job with any missing result is run as a whole.
     keeper: Keeper | None = None
+    # Whether what is known when the user interrupts is of no use: what a search has not run would count as what it has not found.
+    all_or_none: bool = False
 
 
 def run_to_verdict(
@@ -77,6 +79,8 @@ def run_to_verdict(
 
     Interrupted by the user, it returns the verdicts known by then (of jobs in other processes, those of finished jobs); all
     other trajectories have `Verdict.NOT_RUN`.
+
+    **Raises:** `KeyboardInterrupt` if it was interrupted and `all_or_none` are wanted.
     """
     plan, keeper = plan_of(scene, trajectories, method, limits, places), options.keeper
     total = trajectories.total if places is None else len(places)
@@ -92,7 +96,12 @@ def run_to_verdict(
         try:
             for part in plan.parts:
                 run.follow(part)
+            if requested and options.all_or_none:
+                # After the last report: whoever asks has more to do.
+                raise KeyboardInterrupt
         except KeyboardInterrupt:
+            if options.all_or_none:
+                raise
             interrupted(verdicts)
         finally:
             if keeper is not None:

@@ -247,6 +247,11 @@ def test_a_batch_is_what_single_calls_are():
     rows = np.array([np.concatenate([one.ravel(), matrix.ravel(), [count]]) for one in x.reshape(-1, 4)])
     ends, _ = KERNEL.of_many(form, rows, instants)
     np.testing.assert_array_equal(ends["y"].reshape(3, 2, 4), found[0])
+    # A batch may be of none.
+    with jax.enable_x64(True):
+        for way in (jax.vmap, lambda of: jax.jit(jax.vmap(of))):
+            nothing, slopes = way(of)(x[:0, 0]), way(jax.jacfwd(lambda x: of(x)[0]))(x[:0, 0])
+            assert [part.shape for part in (*nothing, slopes)] == [(0, 4), (0, *found[1].shape[2:]), (0, 4, 4)]
 
 
 @pytest.mark.parametrize("size", [3, 7])

@@ -1,10 +1,15 @@
 """Critical kicks by Newton's method, and their derivatives, against scaling laws and an independent solver."""
 
+import json
+import signal
+
 import numpy as np
 import pytest
 
 import fivjax as fj
 from fivjax.kicks.stable_manifold import critical_kick
+from fivjax.maps import engine
+from fivjax.maps.basin_map import verdicts_from
 from tests.helpers import reference
 from tests.helpers.several_contacts import coupled, scene_of
 
@@ -107,3 +112,29 @@ def test_derivatives_of_several_contacts_are_differences_of_kicks():
     # Displacements are forces over stiffness: with the belt's speeds, all scales.
     faster = (kick(belt_speed=np.full(2, 1 + 1e-6)) - kick(belt_speed=np.full(2, 1 - 1e-6))) / 2e-6
     assert 100.0 * float(found.d_p_crit.sel(parameter="force")) == pytest.approx(-faster, rel=1e-6)
+
+
+@pytest.mark.parametrize("at_the_end", [False, True])
+def test_a_search_that_is_interrupted_says_nothing_of_what_it_has_not_run(monkeypatch, at_the_end):
+    """Rows without a scan were said to have no critical kick, and smallest kicks came out larger."""
+    real = engine._Run.follow
+
+    def follow(self, part):
+        if at_the_end:
+            real(self, part)
+        signal.raise_signal(signal.SIGINT)
+        if not at_the_end:
+            real(self, part)
+
+    monkeypatch.setattr(engine._Run, "follow", follow)
+    with pytest.raises(KeyboardInterrupt):
+        fj.critical_perturbation(SCENE, mu=[0.2, 0.227], p_range=(1.0, 1.2), p_step=0.1, progress=False)
+    with pytest.raises(KeyboardInterrupt):
+        verdicts_from(SCENE, np.zeros((2, 6)), "states")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_narrow_range_is_scanned_in_steps_that_fit_in():
+    found = fj.critical_perturbation(SCENE, p_range=(1.105, 1.11), tolerance=1e-3, progress=False)
+    assert float(found.p_crit_low[0]) < 1.1072058 < float(found.p_crit_high[0])
+    assert json.loads(found.attrs["settings"])["p_step"] == pytest.approx(0.005)
