@@ -59,7 +59,7 @@ class RunOptions(NamedTuple):
     executor: Workers | None = None  # runs the jobs; unless given, threads of this process do
     # Gets the results of each job, and has those of an earlier run. A job with any missing result is run as a whole.
     keeper: Keeper | None = None
-    # Whether what is known when the user interrupts is of no use: what a search has not run would count as what it has not found.
+    # Whether what is known by an interrupt is of no use: what a search has not run would count as what it has not found.
     all_or_none: bool = False
 
 
