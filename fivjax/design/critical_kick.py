@@ -87,7 +87,7 @@ def raise_critical_perturbation(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     *,
     p_range: tuple[float, float] = (1.0, 5.0),
-    p_step: float = 0.01,
+    p_step: float | None = None,
     steps: int = 20,
 ) -> RaisedCriticalKick:
     """Raise the critical kick by a share of itself, with the smallest relative change of chosen parameters.

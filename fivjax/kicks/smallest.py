@@ -94,7 +94,7 @@ def smallest_kick(
     over: Literal["state", "history"],
     bounds: dict[str, tuple[float, float]] | None = None,
     *,
-    p_step: float = 0.01,
+    p_step: float | None = None,
     pieces: int = 16,
     progress: bool | None = None,
 ) -> SmallestPerturbation: ...
@@ -106,7 +106,7 @@ def smallest_kick(
     over: Sequence[str] = ("p", "duration"),
     bounds: dict[str, tuple[float, float]] | None = None,
     *,
-    p_step: float = 0.01,
+    p_step: float | None = None,
     pieces: int = 16,
     progress: bool | None = None,
 ) -> SmallestKick: ...
@@ -120,7 +120,7 @@ def smallest_kick(
     over: Sequence[str] = ("p", "duration"),
     bounds: dict[str, tuple[float, float]] | None = None,
     *,
-    p_step: float = 0.01,
+    p_step: float | None = None,
     pieces: int = 16,
     progress: bool | None = None,
 ) -> "SmallestKick | SmallestPerturbation":
@@ -156,7 +156,8 @@ def smallest_kick(
     """
     # Number of searches, from the starts with the smallest p_crit.
     descents = 4
-    arguments.real_number("p_step", p_step, above=0)
+    if p_step is not None:
+        arguments.real_number("p_step", p_step, above=0)
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")

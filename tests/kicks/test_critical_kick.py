@@ -138,3 +138,5 @@ def test_a_narrow_range_is_scanned_in_steps_that_fit_in():
     found = fj.critical_perturbation(SCENE, p_range=(1.105, 1.11), tolerance=1e-3, progress=False)
     assert float(found.p_crit_low[0]) < 1.1072058 < float(found.p_crit_high[0])
     assert json.loads(found.attrs["settings"])["p_step"] == pytest.approx(0.005)
+    with pytest.raises(fj.NoSquealingKick):
+        fj.smallest_kick(SCENE, over="p", bounds={"p": (1.0, 1.005)}, progress=False)
