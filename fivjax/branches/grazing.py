@@ -16,7 +16,7 @@ from ..foundation.numpy_evaluation import by_numpy
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import mechanics_about_sliding
-from .multiple_shooting import AT_SECTION, Mode, PhaseImages, Phases, images_of_phases, inside
+from .multiple_shooting import AT_SECTION, Mode, PhaseImages, Phases, images_of_phases, inside, one_after_another
 from .pseudo_arclength import ComputedCycle, Curve, assembled
 
 NAMES = {
@@ -142,10 +142,10 @@ def images_up_to_minimum(
 
 def up_to_minimum(phases: Phases, minimum: GuardMinimum):
     """All phases and, behind them, that with the minimum up to its instant: modes, those that follow, states, durations."""
-    k, partial, modes = minimum.phase, minimum.mode, phases.modes
+    k, partial = minimum.phase, minimum.mode
     time = phases.h[k] if minimum.at_end else minimum.time
-    y, h = np.concatenate([phases.y, phases.y[k : k + 1]]), np.append(phases.h, time)
-    return (*modes, partial), (*modes[1:], modes[0], partial), y, h
+    modes, following, y, h = one_after_another(phases)
+    return (*modes, partial), (*following, partial), np.concatenate([y, y[k : k + 1]]), np.append(h, time)
 
 
 def without_minimum(found: PhaseImages) -> tuple[PhaseImages, PhaseImages]:

@@ -177,9 +177,12 @@ def same_modes(a: tuple, b: tuple) -> bool:
 
 def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) -> PhaseImages:
     """Images of all phases, and their derivatives by state and duration and along a direction of the parameters."""
-    modes = phases.modes
-    following = modes[1:] + modes[:1]
-    return images_of_phases(scene, direction, stepper, modes, following, phases.y, phases.h)
+    return images_of_phases(scene, direction, stepper, *one_after_another(phases))
+
+
+def one_after_another(phases: Phases):
+    """The modes of all phases, those that follow, states and durations."""
+    return phases.modes, phases.modes[1:] + phases.modes[:1], phases.y, phases.h
 
 
 def images_of_phases(scene: Scene, direction: Scene, stepper: EventExact, modes, following, y, h) -> PhaseImages:

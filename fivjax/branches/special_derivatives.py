@@ -16,7 +16,7 @@ from ..model.directions import direction_of, moved_along
 from ..model.scene import Scene
 from .branch_points import BranchPoint
 from .grazing import images_up_to_minimum, row_of, up_to_minimum, without_minimum
-from .multiple_shooting import PhaseImages, images_along
+from .multiple_shooting import PhaseImages, images_along, one_after_another
 from .pseudo_arclength import Curve, Family, assembled, multipliers_of
 from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
@@ -43,17 +43,20 @@ def _derivatives(family: Family, special: Special, names: list[str]) -> list[flo
     if special.name == MEETS_SLIDING:
         return [_of_stability_limit(family, cycle.parameter, name) for name in names]
     directions = [direction_of(family.scene, name) for name in names]
-    asked = (
-        (phases.modes, phases.modes[1:] + phases.modes[:1], phases.y, phases.h)
-        if special.grazing is None
-        else up_to_minimum(phases, special.grazing.minimum)
-    )
+    asked, row = one_after_another(phases), special.row
+    if special.grazing is not None:
+        minimum = special.grazing.minimum
+        asked = up_to_minimum(phases, minimum)
+        _, partial = images_up_to_minimum(special.curve, cycle.parameter, phases, minimum)
+        row = row_of(special.curve, phases, minimum, partial)
     found = images_along(family.at(cycle.parameter), directions, family.stepper, *asked)
-    return [_derivative(family, special, *each) for each in zip(names, directions, found, strict=True)]
+    return [_derivative(family, special, row, *each) for each in zip(names, directions, found, strict=True)]
 
 
-def _derivative(family: Family, special: Special, name: str, direction: Scene, found: PhaseImages) -> float:
-    """From the images of phases along the direction, of which the last is up to the minimum that grazes, if one does."""
+def _derivative(family: Family, special: Special, row, name: str, direction: Scene, found: PhaseImages) -> float:
+    """From the images of phases along the direction, of which the last is up to the minimum that grazes, if one does. The
+    `row` has the derivatives of what is zero at the point besides the cycle's equations.
+    """
     curve, cycle = special.curve, special.cycle
     if name == "restitution" and _is_inelastic(family) and _rebounds_change(special):
         return np.nan
@@ -70,12 +73,8 @@ def _derivative(family: Family, special: Special, name: str, direction: Scene, f
         return float(-(null @ slope) / (null @ own[:, -1]) * curve.scales[-1])
     if special.multiplier is not None:
         return _of_multiplier(family, special, name, direction, own, slope)
-    if special.row is None:
+    if row is None:
         return np.nan
-    row = special.row
-    if special.grazing is not None:
-        _, itself = images_up_to_minimum(curve, cycle.parameter, cycle.phases, special.grazing.minimum)
-        row = row_of(curve, cycle.phases, special.grazing.minimum, itself)
     system = np.vstack([own, row])
     sizes = np.max(np.abs(system), axis=1)
     scaled = system / sizes[:, None]

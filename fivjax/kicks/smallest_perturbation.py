@@ -68,16 +68,14 @@ class SmallestPerturbation(NamedTuple):
             values = {"displacement": ("coordinate", displacement), "velocity": ("coordinate", velocity)}
         else:
             values = {"p": ("piece", np.asarray(self.values))}
-        unit, meanings = (
-            "sqrt(J)" if self.over == "state" else "1",
-            (
-                ("size", "smallest size found that leads to a limit cycle"),
-                ("certified", "size below which everything slides for ever"),
-                ("proved_low", "size of the same shape that was proved to slide"),
-                ("proved_high", "size of the same shape that was proved to end on a limit cycle"),
-            ),
-        )
-        for name, meaning in meanings:
+        unit = "sqrt(J)" if self.over == "state" else "1"
+        meanings = {
+            "size": "smallest size found that leads to a limit cycle",
+            "certified": "size below which everything slides for ever",
+            "proved_low": "size of the same shape that was proved to slide",
+            "proved_high": "size of the same shape that was proved to end on a limit cycle",
+        }
+        for name, meaning in meanings.items():
             values[name] = ((), getattr(self, name), {"units": unit, "long_name": meaning})
         return dataset_of(values, self.scene, over=self.over).assign_attrs(trajectories=self.trajectories)
 
