@@ -14,6 +14,7 @@ class Ending(enum.IntEnum):
 
     FINISHED = 0
     NOT_FINITE = -2
+    NO_EQUILIBRIUM = -3
     PAINLEVE = -4
     TOO_MANY_EVENTS = -6
     UNBOUNDED = -7
@@ -27,6 +28,8 @@ ENDING = {
     Ending.FINISHED: "reached its end",
     Ending.NOT_FINITE: "the state stopped being finite, and the rows from there on are NaN; take a smaller step or check the "
     "parameters",
+    Ending.NO_EQUILIBRIUM: "there is no steady sliding to start from, and all rows are NaN; change the load, its direction or "
+    "the friction, or give `y0`",
     Ending.PAINLEVE: "the contact problem has no unique solution at this friction (Painlevé), so the motion is one of several; "
     "lower the friction or the coupling in the mass matrix",
     Ending.TOO_MANY_EVENTS: "contact events came without end, or thousands of them between two saved rows, and the rows from "

@@ -17,7 +17,7 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.polynomial import value_and_rate
 from ..kernels.functions import KernelFunction
-from ..model.scene import Scene, steady_sliding
+from ..model.scene import Scene
 from ..steppers.base import advance_between
 from ..steppers.core import Segment, end_after, next_part
 from ..steppers.event_exact import EventExact, for_derivatives
@@ -26,6 +26,7 @@ from .ending import Ending
 from .energy import EnergyData, Ledger
 from .jump_instants import StartOfRun, load_from, next_jump, start_of_run
 from .rows import contact_after_jump, grown, row_of
+from .start import at_equilibrium
 
 
 class MotionAsked(eqx.Module):
@@ -84,13 +85,12 @@ def rows_by_kernel(
 
 def _followed(args, instants, method: EventExact):
     scene, y0, most, how = args
+    exists = jnp.ones((), bool)
     if y0 is None:
-        q, _ = steady_sliding(scene, scene.load.force)
-        y0 = jnp.concatenate([q, jnp.zeros_like(q)])
+        y0, exists = at_equilibrium(scene)
     mechanics = Mechanics(scene)
     energy_data = EnergyData(scene) if how.energy else None
     begin = _first_step(scene, mechanics, y0, method, energy_data)
-    none = jnp.zeros((), bool)
 
     def step(now: Step) -> Step:
         return _next_step(scene, mechanics, method, energy_data, now)
@@ -132,7 +132,8 @@ def _followed(args, instants, method: EventExact):
         return (now, lost, ending), row
 
     instants_begin = begin.t
-    start = begin, none, jnp.asarray(Ending.FINISHED, jnp.int32)
+    ending = jnp.where(exists, Ending.FINISHED, Ending.NO_EQUILIBRIUM).astype(jnp.int32)
+    start = begin, ~exists, ending
     (_, _, ending), rows = jax.lax.scan(to_row, start, instants)
     return jnp.where(physics.slides_uniquely(mechanics), ending, Ending.PAINLEVE).astype(jnp.int32), rows
 

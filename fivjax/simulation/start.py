@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from ..contact import State
 from ..foundation import arguments
@@ -24,10 +25,13 @@ def start_state(scene: Scene, y0) -> State | np.ndarray:
     """The state that a run starts from: `y0`, checked, or else the sliding equilibrium at rest."""
     n = scene.structure.size
     if y0 is None:
-        # The first function refuses a scene without equilibrium; inside a compiled function that is not possible.
-        known = is_known(scene.belt_speed)
-        q = sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0]
-        return np.concatenate([q, np.zeros_like(q)]) if is_known(q) else jnp.concatenate([q, jnp.zeros_like(q)])
+        if all(map(is_known, jax.tree.leaves(scene))):
+            q = sliding_equilibrium(scene)
+            return np.concatenate([q, np.zeros_like(q)])
+        refuse_belt_at_rest(scene)
+        # Inside a compiled function, a scene without equilibrium cannot be refused.
+        y, exists = at_equilibrium(scene)
+        return jnp.where(exists, y, jnp.nan)
     y = checked_start(n, y0)
     if is_known(y):
         # Rounding may put the state of a cycle, or of a run before, a little below the belt.
@@ -48,6 +52,13 @@ def start_state(scene: Scene, y0) -> State | np.ndarray:
                     f"is {float(y[n + normal]):g} m/s. Start a little above the belt."
                 )
     return y
+
+
+def at_equilibrium(scene: Scene) -> tuple[State, Bool[Array, ""]]:
+    """The state of steady sliding, and whether there is one: the belt moves, and its normal forces press."""
+    q, normal_force = steady_sliding(scene, scene.load.force)
+    exists = jnp.all(normal_force >= 0) & jnp.all(jnp.isfinite(q)) & (scene.belt_speed != 0)
+    return jnp.concatenate([q, jnp.zeros_like(q)]), exists
 
 
 def checked_start(n: int, y0) -> State:

@@ -254,7 +254,7 @@ def simulate(
             modes = None if derivatives == "none" else derivatives
             found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
     if "grown" in found:
-        ending = _ending(scene, stepper, found, found.pop("grown"), most)
+        ending = _ending(scene, stepper, found, found.pop("grown"), most, given is None)
     settings = (
         ("method", describe_method(method)),
         ("dt", float(method.dt)),
@@ -288,12 +288,16 @@ def _at_contacts(rows: Float[Returned, "T n"], directions: np.ndarray) -> Float[
     return along[:, 0] if directions.shape[1] == 1 else along
 
 
-def _ending(scene: Scene, method: AbstractStepper, rows: dict, grown, most: int) -> Array | np.int8:
+def _ending(
+    scene: Scene, method: AbstractStepper, rows: dict, grown, most: int, from_equilibrium: bool
+) -> Array | np.int8:
     """How the rows end: an `Ending`. Under a transformation, where values are unknown, other failures count as not finite."""
     if not is_known(rows["velocity"]):
         finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
         failure = jnp.where(jnp.any(grown), Ending.UNBOUNDED, Ending.NOT_FINITE)
         outcome = jnp.where(jnp.all(finite), Ending.FINISHED, failure)
+        if from_equilibrium:
+            outcome = jnp.where(finite[0], outcome, Ending.NO_EQUILIBRIUM)
         return jnp.where(physics.slides_uniquely(Mechanics(scene)), outcome, Ending.PAINLEVE).astype(jnp.int8)
     finite = np.all(np.isfinite(rows["velocity"]), axis=-1)
     if np.all(finite):

@@ -18,7 +18,7 @@ class Verdict(enum.IntEnum):
     LIMIT_CYCLE = 1
     UNDECIDED = -1
     NOT_FINITE = Ending.NOT_FINITE
-    NO_EQUILIBRIUM = -3
+    NO_EQUILIBRIUM = Ending.NO_EQUILIBRIUM
     PAINLEVE = Ending.PAINLEVE
     NOT_RUN = -5
     TOO_MANY_EVENTS = Ending.TOO_MANY_EVENTS

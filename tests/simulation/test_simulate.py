@@ -199,6 +199,21 @@ def test_a_run_says_how_it_ended(paper_scene):
     assert np.all(np.isnan(fast.velocity[-1]))
 
 
+@pytest.mark.parametrize(
+    "method", [QUICK, pytest.param(fj.WhereSwitched(diffrax.Tsit5(), dt=1e-4), marks=pytest.mark.slow)]
+)
+def test_a_belt_that_would_have_to_pull_is_told_inside_a_transformation(paper_scene, method):
+    """Where nothing can be refused, the lanes without a steady sliding to start from say so, and the others go on."""
+
+    def run(scale):
+        run = fj.simulate(paper_scene.replace(force=100.0 * scale), 5e-3, 1e-3, method, derivatives="none")
+        return run.outcome, run.displacement
+
+    outcome, rows = jax.jit(jax.vmap(run))(np.array([1.0, -1.0]))
+    assert outcome.tolist() == [fj.Ending.FINISHED, fj.Ending.NO_EQUILIBRIUM]
+    assert np.all(np.isfinite(rows[0])) and np.all(np.isnan(rows[1]))
+
+
 def test_growth_without_bound_is_a_failure_with_a_name(paper_scene):
     """Rejects a run of Tsit5 with steps far too long that ends at 1e123 m/s and is said to have reached its end."""
     run = fj.simulate(paper_scene, 0.5, 1e-2, fj.WhereSwitched(diffrax.Tsit5(), dt=5e-3))
