@@ -243,18 +243,23 @@ def _met_before(points: list[BranchPoint], last: BranchPoint) -> _Met | None:
     if last.real is None:
         return None
     parameters = np.array([point.cycle.parameter for point in points])
-    value, period = last.cycle.parameter, last.cycle.phases.period
+    value = last.cycle.parameter
     for k in np.flatnonzero((parameters[:-2] - value) * (parameters[1:-1] - value) <= 0):
         near = points[k]
+        # How long the cycles are, and how large: each may differ by so much.
+        one, other, own = (
+            np.array([phases.period, phases.size(near.curve.weights)])
+            for phases in (point.cycle.phases for point in (near, points[k + 1], last))
+        )
+        differing = own * [same, 10 * same]
         # Between these two points, or nearly so: elsewhere the cycle need not be computed.
-        one, other = near.cycle.phases.period, points[k + 1].cycle.phases.period
-        if abs(period - 0.5 * (one + other)) > 1.5 * abs(one - other) + same * period:
+        if np.any(np.abs(own - 0.5 * (one + other)) > 1.5 * np.abs(one - other) + differing):
             continue
         before = near.curve.at_parameter(near.cycle.u, value)
-        if before is None or abs(before.phases.period - period) > same * period:
+        if before is None:
             continue
-        size, own = (at.phases.size(near.curve.weights) for at in (before, last.cycle))
-        if abs(size - own) <= 10 * same * size:
+        found = np.array([before.phases.period, before.phases.size(near.curve.weights)])
+        if np.all(np.abs(found - own) <= differing):
             onwards = (parameters[k + 1] - parameters[k]) * (value - parameters[-1]) > 0
             return _Met(bool(onwards), int(k + np.argmax(np.abs(parameters[k:] - value))))
     return None

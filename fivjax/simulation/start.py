@@ -57,7 +57,7 @@ def start_state(scene: Scene, y0) -> State | np.ndarray:
 def at_equilibrium(scene: Scene) -> tuple[State, Bool[Array, ""]]:
     """The state of steady sliding, and whether there is one: the belt moves, and its normal forces press."""
     q, normal_force = steady_sliding(scene, scene.load.force)
-    exists = jnp.all(normal_force >= 0) & jnp.all(jnp.isfinite(q)) & (scene.belt_speed != 0)
+    exists = jnp.all((normal_force >= 0) & (scene.belt_speed != 0)) & jnp.all(jnp.isfinite(q))
     return jnp.concatenate([q, jnp.zeros_like(q)]), exists
 
 
