@@ -664,6 +664,7 @@ def test_a_cycle_meets_the_section_by_an_impact_after_which_it_sticks(along):
     np.testing.assert_allclose(found.amplitude, 0.4727571, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_cycle_meets_the_section_by_an_impact_that_ends_the_slip_and_slides_back():
     """Without slip, but sliding: the forces lie outside the cone. The velocity is not free there either."""
     stiffness = np.array([[2.133, 1.27, 0.717], [1.27, 4.342, 1.269], [0.717, 1.269, 1.826]])
@@ -723,6 +724,7 @@ def test_a_cycle_that_meets_the_section_by_an_impact_is_followed_to_neighbours(p
     assert slope == pytest.approx((ahead - behind) / (2 * apart), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_chaos_that_is_weak_is_no_torus():
     """A mass that rebounds: all comes back to a set that looks like a torus, but on it neighbours part, by an e-fold in a hundred
     returns. As a torus it had an amplitude that depended on who asked.

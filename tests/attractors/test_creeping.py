@@ -47,6 +47,7 @@ def on_line(drift, starts, arrived, most=3.0, coupling=0.01):
     return creeps, last.y[:, 0], time
 
 
+@pytest.mark.slow
 def test_pairs_of_cycles_are_not_leapt_over():
     """Two cycles, born in a fold, lie closer to each other than a leap is long: what comes from below stays at the lower one."""
     pairs = np.meshgrid(np.linspace(0.5, 0.9, 5), np.linspace(1.0, 1.06, 7), [0.03, 0.01, 1e-3])

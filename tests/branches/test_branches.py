@@ -113,6 +113,7 @@ def test_where_modes_change_a_cycle_has_the_branch_s_multipliers(branch):
         assert np.max(np.min(apart, axis=0)) == 0 and cycle.stable == bool(branch.stable[i])
 
 
+@pytest.mark.slow
 def test_a_branch_begins_where_a_landing_makes_the_velocity_jump_through_zero():
     """The cycle's point on the section is the end of an event, which one period from there on does not see again."""
     structure = fj.Structure(
@@ -161,6 +162,7 @@ def test_what_a_branch_goes_on_over_does_not_depend_on_where_it_ends():
     assert grazing == pytest.approx(1.3140882, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_a_branch_goes_on_over_a_gap_where_a_rebound_grazes():
     """With one rebound fewer the cycle is stable again: the parameter turns back at a fold, and again where the gap grazes zero."""
     mass, load = np.diag([0.61, 0.1166, 0.1462, 0.8851]), [0.0, -0.5, 0.0, -1.0]
@@ -507,6 +509,7 @@ CORNERED = fj.Scene(
 NEAR_A_CORNER = [-0.0041756638, 0.0040101764, 0.0051538719, 0.0, -1.44457, -2.600327], 2
 
 
+@pytest.mark.slow
 def test_a_branch_turns_back_where_an_impact_begins_to_end_the_slip_in_the_same_modes():
     """Twice: an independent shooting has the corners at these values. The part between lies beside the others, and is not missed."""
     branch = fj.continue_cycle(CORNERED, "mu_dynamic", (0.0399, 0.0486), start=fj.limit_cycle(CORNERED, NEAR_A_CORNER))

@@ -129,6 +129,7 @@ def test_friction_that_falls_with_speed_from_two_belt_speeds():
     assert max(scores(fit, scene).values()) < 4
 
 
+@pytest.mark.slow
 def test_a_kick_under_falling_friction():
     """Samples at instants of a response that is no sum of modes: followed step by step."""
     law, kick = fj.ExponentialDecay(0.25, 0.15, 0.5), fj.Pulse(100.0, 1.3)

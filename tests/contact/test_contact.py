@@ -777,7 +777,7 @@ def admissible_modes(scene, load, y):
     return found
 
 
-@pytest.mark.parametrize("count", [2, 5])
+@pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_modes_of_several_contacts_are_those_that_the_laws_admit(count):
     """Up to four contacts all combinations are tried; more are found by pivoting. Trying all by hand leaves one."""
     scene, rng, n = coupled_contacts(count), np.random.default_rng(7), 2 * count
@@ -818,7 +818,7 @@ def test_pivoting_finds_from_anywhere_what_trying_all_finds():
     assert set(by_all.ravel().tolist()) == {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize("count", [3, 5])
+@pytest.mark.parametrize("count", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_the_contact_whose_limit_is_reached_breaks_away_and_no_other_that_holds(count):
     """With static friction above kinetic, another one might slip in its place and relieve it. By hand: it slips, and of the
     others those whose limit is exceeded then."""

@@ -342,6 +342,7 @@ def test_a_phase_that_an_event_ends_where_the_section_is_counts_twice(contacts, 
     assert found[0].status == ((fj.Status.SLIDE,) * contacts if contacts > 1 else fj.Status.SLIDE)
 
 
+@pytest.mark.slow
 def test_a_coordinate_that_no_spring_holds_may_be_beside_a_cycle():
     """A block on a spring, pressed on by the load alone, under friction that falls: it sticks and slips, at the reference's speed."""
     structure = fj.Structure(
@@ -371,6 +372,7 @@ def test_a_locked_torus_is_named_as_the_cycle_that_it_is():
     assert len(path) == 13 and apart.min() > 0.01 * apart.max()
 
 
+@pytest.mark.slow
 def test_newton_s_points_lie_on_the_section_in_spite_of_rounding():
     """A tangential velocity of -1e-22 m/s would rise through zero at once: a "cycle" that closes after no time."""
     scene = full_matrices()

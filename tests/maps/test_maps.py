@@ -315,6 +315,7 @@ def test_a_map_says_what_it_is_and_survives_the_disk(paper_scene, tmp_path):
     assert json.loads(back["verdict"].attrs["meaning"])["0"].startswith("returns to steady sliding")
 
 
+@pytest.mark.slow
 def test_the_highest_speed_of_a_motion_may_lie_in_a_flight_shorter_than_an_interval():
     """There samples on both sides are slower, and the next one is behind the landing: amplitudes were up to 1.5 % too low."""
     stiffness = np.array(

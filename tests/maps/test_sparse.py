@@ -157,6 +157,7 @@ def test_what_is_no_sparse_map_or_not_on_its_axes_is_refused(scene):
         fj.bistability_map(scene, mu=fine / 10, p=fine, refine=26, sparse=True)
 
 
+@pytest.mark.slow
 def test_an_interrupted_sparse_map_goes_on_from_its_file(scene, tmp_path, monkeypatch):
     """In the coarse grid, and in a halving: what is finished is on the disk, and only that; the end is the same, bit for bit."""
     monkeypatch.setattr(plan, "IN_A_JOB", 8)

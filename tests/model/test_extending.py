@@ -101,6 +101,7 @@ def test_a_law_is_a_jax_function_of_a_number_to_a_number(result, fragments):
         scene_with(law())
 
 
+@pytest.mark.slow
 def test_a_motion_that_fades_below_all_numbers_has_no_events():
     """Without bounds on its variation nothing is proved of a law, so a motion is followed until its steps take no time."""
     law = type("Bare", (Law,), {"variation": fj.AbstractFriction.variation})

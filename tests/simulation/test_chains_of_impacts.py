@@ -62,6 +62,7 @@ def test_a_jump_of_the_load_amid_the_last_flights_of_a_chain(flight, exist):
     assert found.exist is exist, found.reason
 
 
+@pytest.mark.slow
 def test_two_masses_kick_each_other_up_ever_less():
     """Both slip ahead all the time, so each contact's impulse along the belt is μ times the one away from it, and these are what
     stops the masses: J = F t - M v. Each landing lifts the other contact by 0.3 of its speed.

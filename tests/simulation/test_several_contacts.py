@@ -351,6 +351,7 @@ def test_derivatives_through_events_of_two_contacts_that_fall_together(second):
     assert worst < 1e-7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 5])
 def test_equal_contacts_that_move_in_step_have_events_of_their_own(seed):
     """Bit for bit the same motion: where one lands, sticks or reverses its slip, the other does so by its own event, whose instant
