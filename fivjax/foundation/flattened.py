@@ -23,11 +23,11 @@ class Flattened(eqx.Module):
     @property
     def tree(self) -> PyTree:
         """The tree again. For a NumPy array its real and complex leaves are views: writing to them changes this array."""
-        structure, shapes, types = self.form
-        rows = self.numbers.shape[:-1]
+        (structure, shapes, types), numbers = self.form, self.numbers
+        rows = numbers.shape[:-1]
 
         def leaf(place: _Place) -> Array | np.ndarray:
-            part = self.numbers[..., place.numbers]
+            part = numbers[..., place.numbers]
             if place.is_complex and isinstance(part, np.ndarray):
                 part = part.view(np.complex128)
             elif place.is_complex:

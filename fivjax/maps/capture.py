@@ -59,17 +59,17 @@ class Capture:
         self.known_at_last: dict[int, Attractors] = {}
         # Time that the known cycles of each group take to attract, and the most that is waited for them, s.
         self.settled_by = np.zeros(len(parameters))
-        self.most_time = 20000.0 * np.asarray(batch.shared.tree.modes.slowest_period)
+        self.most_time = 20000.0 * np.asarray(batch.constants.modes.slowest_period)
 
     def _catalogue(self, maps: ReturnMaps, known: dict[int, Attractors]) -> Catalogue:
         return Catalogue(maps, known, self.report, self.batch.task.from_afar)
 
     def _return_maps(self) -> ReturnMaps:
-        batch, tree, scene = self.batch, self.batch.shared.tree, self.batch.task.scene
+        batch, own, scene = self.batch, self.batch.constants, self.batch.task.scene
         exact = batch.kernels is not None or isinstance(batch.task.method, EventExact)
         known_to = ROUNDED if exact else INTERPOLATED
         return ReturnMaps(
-            scene.structure, tree.mechanics, tree.longest_return, batch.section_kernels, batch.pool, known_to
+            scene.structure, own.mechanics, own.longest_return, batch.section_kernels, batch.pool, known_to
         )
 
     def state(self) -> tuple[np.ndarray, dict[int, Attractors], dict[int, Attractors]]:
@@ -95,7 +95,7 @@ class Capture:
             known.update((keys[g], found[g]) for g in groups)
             keep()
 
-        equilibrium = np.asarray(self.batch.shared.tree.modes.linear.equilibrium)
+        equilibrium = np.asarray(self.batch.constants.modes.linear.equilibrium)
         search_groups(self._catalogue(self.maps, found), equilibrium, seeds, add)
         for g in groups:
             # Without what trajectories find by themselves.

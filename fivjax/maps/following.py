@@ -42,6 +42,7 @@ class Batch:
     def __init__(self, task: Task, of_groups: Float[np.ndarray, "g k"], pool: Executor):
         self.task, self.pool = task, pool
         self.shared = constants_of(task, of_groups)
+        self.constants: GroupConstants = self.shared.tree
         # Of several contacts a trajectory takes more memory.
         self.block = BLOCK_OF_SEVERAL if len(task.scene.structure.contacts) > 1 else None
 
@@ -53,8 +54,8 @@ class Batch:
     @cached_property
     def section_kernels(self) -> SectionKernels | None:
         """Those of return maps, which are exact whatever follows the trajectories."""
-        tree = self.shared.tree
-        return section_kernels(self.task.scene, tree.mechanics, tree.longest_return, self.pool, side_by_side=True)
+        own = self.constants
+        return section_kernels(self.task.scene, own.mechanics, own.longest_return, self.pool, side_by_side=True)
 
 
 def begin_all(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
@@ -109,7 +110,7 @@ def _follow_by_kernel(
     now = trajectories.tree[1]
     began, events = now.t.copy(), now.events
     kernels.follow(group, trajectories, steps)
-    asks = np.flatnonzero(_may_be_concluded(batch.shared.tree, group, began, events, trajectories.tree[1]))
+    asks = np.flatnonzero(_may_be_concluded(batch.constants, group, began, events, trajectories.tree[1]))
     if len(asks):
         kernels.conclude(group, trajectories, asks, began)
 
@@ -133,9 +134,9 @@ def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.
     """Bounds on the shares of their margins that motions from these states can use up under their final loads: those below 1
     slide for ever.
     """
-    tree = batch.shared.tree
+    own = batch.constants
     return in_blocks(
-        _bounds, flatten((tree.mechanics, tree.modes)), group, at.flattened(), 1, batch.pool, size=BLOCK
+        _bounds, flatten((own.mechanics, own.modes)), group, at.flattened(), 1, batch.pool, size=BLOCK
     ).tree
 
 

@@ -98,7 +98,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     known_from, own_from = 4 * task.method.round, 16 * task.method.round
     limit = task.limits.t_max
     if limit is None:
-        period = np.asarray(batch.shared.tree.modes.slowest_period)
+        period = np.asarray(batch.constants.modes.slowest_period)
         limit = np.where(period > 0, PERIODS * period, WITHOUT_PERIOD)
     limit = np.broadcast_to(limit, len(of_groups))
     done = 0

@@ -49,12 +49,13 @@ class TrajectoryKernels:
         self.first = jax.tree.map(lambda leaf: leaf[0], of_groups)
         self.table = numbers_in_rows(of_groups)
         self.shared, self.pool = len(jax.tree.leaves(self.first)), pool
+        self.forms: dict[KernelFunction, Form] = {}
 
     def begin(self, group: Int[np.ndarray, " m"], kick: Float[np.ndarray, "m k"], initial) -> Flattened:
         """Trajectories at their beginning, each with its kick and initial state."""
         progress: Progress = self._of_each(_begin, group, (kick, initial))
-        to_follow = self._form((kick, progress, np.zeros(len(kick), np.int32)))
-        to_conclude = self._form((kick, progress, progress.t))
+        to_follow = self._form(_follow, (kick, progress, np.zeros(len(kick), np.int32)))
+        to_conclude = self._form(_conclude, (kick, progress, progress.t))
 
         def build():
             kernel_of(_follow, to_follow, shared=self.shared, side_by_side=self.side_by_side).of_lanes.on_cpu  # noqa: B018
@@ -84,9 +85,12 @@ class TrajectoryKernels:
             part = part.reshape(len(rows), -1)
             trajectories.numbers[rows, start : start + part.shape[1]] = part
 
-    def _form(self, own: tuple) -> Form:
-        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
-        return Form.of((self.of_task, self.first, *first))[0]
+    def _form(self, function: KernelFunction, own: tuple) -> Form:
+        """The form of a function's arguments, which is that of all calls."""
+        if function not in self.forms:
+            first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
+            self.forms[function] = Form.of((self.of_task, self.first, *first))[0]
+        return self.forms[function]
 
     def _of_each(
         self,
@@ -99,7 +103,7 @@ class TrajectoryKernels:
         """The results of a kernel for each trajectory, of its group's data and its own. What takes few steps is over on a CPU
         before another kernel is compiled.
         """
-        form, given, parts = self._form(own), numbers_in_rows(own), []
+        form, given, parts = self._form(function, own), numbers_in_rows(own), []
         for rows in in_parts(len(group), 8 * given.shape[1]):
             groups = Groups.of(self.table, group[rows])
             run = function.of_groups(form, self.shared, groups, given[rows], self.pool, on_gpus, side_by_side)
