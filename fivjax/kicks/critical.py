@@ -1,11 +1,10 @@
 """Critical kicks: the smallest that lead to a limit cycle, found by a scan and narrowed down in batches."""
 
-import functools
 import json
-import math
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Float, Int
 
 from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
@@ -13,12 +12,11 @@ from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import check_axis_names, labelled
 from ..maps.axes import check_run, check_size, checked_axes, linear_limit
-from ..maps.crossing import FirstCrossing, first_crossings, with_ends
+from ..maps.crossing import FirstCrossing
 from ..maps.datasets import time_limit
-from ..maps.engine import RunOptions, run_to_verdict
+from ..maps.engine import RunOptions
 from ..maps.executors import with_workers
 from ..maps.groups import Limits
-from ..maps.plan import TrajectoryList
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
@@ -27,6 +25,7 @@ from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
 from .critical_derivatives import differentiable, with_derivatives
+from .narrowing import AT_ENDS, Kicked, Scan
 
 # The steps of a scan, unless given.
 P_STEP = 0.01
@@ -121,6 +120,54 @@ def critical_perturbation(
         # Any scalar parameter serves as the axis.
         name = "belt_speed" if np.ndim(scene.belt_speed) == 0 else "force"
         axis = {name: np.asarray(scene.parameters[name])[None]}
+    arguments.real_number("tolerance", tolerance, above=0)
+    low, high, p_step, scanned = _checked_range(p_range, p_step)
+    check_size({**axis, "p": range(scanned)}, energy=bool(energy))
+    axes = checked_axes(scene, axis)
+    check_axis_names(axes, OF_RESULTS, "critical kicks")
+    columns = {
+        name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
+    }
+    options = RunOptions("scan", memory, progress, executor, all_or_none=True)
+    kicked = Kicked(scene, columns, method, Limits(t_max), options, {})
+    scan = Scan.of(kicked, np.linspace(low, high, scanned))
+    # Newton's method mostly finds the kick from what one round leaves.
+    fine, contradicted = kicked.narrowed(*scan.brackets, tolerance, 1 if derivatives else None)
+    answers = {}
+    if derivatives:
+        stage("Newton's method and derivatives")
+
+        def narrowed(rows: Int[np.ndarray, " s"], found: FirstCrossing) -> FirstCrossing:
+            ends = np.tile(AT_ENDS, (len(rows), 1))
+            finer, again = kicked.only(rows).narrowed(found.brackets[rows], ends, tolerance)
+            contradicted[rows] |= again
+            return finer
+
+        fine, answers = with_derivatives(kicked, fine, narrowed)
+    # If the lower end of the range already squeals, there is no kick that slides.
+    width = np.where(np.isnan(fine.low), 0.0, fine.high - fine.low)
+    error = np.where(np.isnan(fine.middle), np.nan, 0.5 * width + _stepping_error(kicked, fine, p_step, tolerance))
+    found = {
+        "p_crit": fine.middle,
+        "p_crit_low": fine.low,
+        "p_crit_high": fine.high,
+        "p_crit_error": error,
+        "crossings": scan.seen.changes,
+        "only_crossing": scan.has_one_change & ~contradicted,
+        **answers,
+    }
+    if energy:
+        found |= _energies_of_the_kick(kicked, fine.middle)
+    dataset = _over_axes(axes, found, scene)
+    dataset.attrs.update(linear_limit(scene, axes))
+    dataset.attrs["range"] = json.dumps([float(low), float(high)])
+    return labelled(
+        dataset, scene, method=describe_method(method), **time_limit(t_max), tolerance=tolerance, p_step=p_step
+    )
+
+
+def _checked_range(p_range, p_step: float | None) -> tuple[float, float, float, int]:
+    """The ends of the range of p, the steps of its scan, and how many kicks there are in it."""
     if not isinstance(p_range, tuple | list) or len(p_range) != 2:
         kind = TypeError if not isinstance(p_range, tuple | list) else ValueError
         raise kind(f"Argument `p_range` must be a pair of numbers, such as (1.0, 5.0), but is {p_range!r}.")
@@ -130,175 +177,45 @@ def critical_perturbation(
     if p_step is None:
         p_step = min(P_STEP, float(high) - float(low))
     arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
-    arguments.real_number("tolerance", tolerance, above=0)
-    scanned = round(min((high - low) / p_step, 1e15)) + 1
-    check_size({**axis, "p": range(scanned)}, energy=bool(energy))
-    axes = checked_axes(scene, axis)
-    check_axis_names(axes, OF_RESULTS, "critical kicks")
-    shape = tuple(len(values) for values in axes.values())
-    columns = {
-        name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
-    }
-
-    known: dict = {}  # attractors of the rows, which are the same in the scan and in all later runs
-
-    def run(values, method, label: str, limits: Limits | None = None):
-        limits = Limits(t_max) if limits is None else limits
-        options = RunOptions(label, memory, progress, executor, all_or_none=True)
-        return run_to_verdict(scene, TrajectoryList(values), method, limits, options, attractors=known)
-
-    scan = np.linspace(low, high, scanned)
-    verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")
-    seen = first_crossings(scan, verdicts)
-    brackets, at_ends = _to_narrow(scan, verdicts, seen)
-    # Newton's method mostly finds the kick from what one round leaves.
-    few = derivatives and not isinstance(method, WhereSwitched)
-    fine, contradicted = _narrowed(run, method, columns, brackets, at_ends, tolerance, 1 if few else None)
-    stepping = np.zeros(math.prod(shape))
-    if isinstance(method, WhereSwitched):
-        # Errors are first order in the step, so halving it changes the result by as much as the remaining error.
-        coarse_method = WhereSwitched(method.solver, 2 * method.dt)
-        around = np.maximum(fine.brackets + p_step * np.array([-1.0, 1.0]), 0.0)
-        unknown = np.full(around.shape, Verdict.UNDECIDED)
-        coarse, _ = _narrowed(run, coarse_method, columns, around, unknown, tolerance)
-        stepping = np.where(np.isnan(fine.low), 0.0, np.abs(coarse.middle - fine.middle))
-    answers = {}
-    if derivatives:
-        stage("Newton's method and derivatives")
-
-        def narrowed(rows: np.ndarray, found: FirstCrossing) -> FirstCrossing:
-            chosen = {name: column[rows] for name, column in columns.items()}
-            ends = np.tile([Verdict.SLIDING, Verdict.LIMIT_CYCLE], (len(rows), 1))
-            finer, again = _narrowed(run, method, chosen, found.brackets[rows], ends, tolerance)
-            contradicted[rows] |= again
-            return finer
-
-        verdicts_of = functools.partial(_verdicts, run, method)
-        fine, answers = with_derivatives(scene, verdicts_of, columns, fine, narrowed if few else None)
-    # If the lower end of the range already squeals, there is no kick that slides.
-    width = np.where(np.isnan(fine.low), 0.0, fine.high - fine.low)
-    dataset = xr.Dataset(
-        {
-            name: (tuple(axes), values.reshape(shape))
-            for name, values in {
-                "p_crit": fine.middle,
-                "p_crit_low": fine.low,
-                "p_crit_high": fine.high,
-                "p_crit_error": np.where(np.isnan(fine.middle), np.nan, 0.5 * width + stepping),
-                "crossings": seen.changes,
-                "only_crossing": (seen.changes <= 1) & ~contradicted & ~_hidden(scan, verdicts, seen),
-            }.items()
-        },
-        coords=axes,
-    )
-    if derivatives:
-        slopes = answers.pop("d_p_crit")
-        dataset["d_p_crit"] = ((*axes, "parameter"), slopes.reshape(*shape, -1))
-        dataset = dataset.assign_coords(parameter=list(differentiable(scene)))
-        dataset = dataset.assign({name: (tuple(axes), values.reshape(shape)) for name, values in answers.items()})
-    if energy:
-        for name, values in _energies_of_the_kick(run, method, scene, {**columns, "p": fine.middle}).items():
-            dataset[name] = (tuple(axes), values.reshape(shape))
-    dataset.attrs.update(linear_limit(scene, axes))
-    dataset.attrs["range"] = json.dumps([float(low), float(high)])
-    return labelled(
-        dataset, scene, method=describe_method(method), **time_limit(t_max), tolerance=tolerance, p_step=p_step
-    )
+    return low, high, p_step, round(min((high - low) / p_step, 1e15)) + 1
 
 
-def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _stepping_error(
+    kicked: Kicked, fine: FirstCrossing, p_step: float, tolerance: float
+) -> Float[np.ndarray, " r"] | float:
+    """By how much steps of one size may have moved the critical kicks. Errors are of first order in the step, so doubling it
+    changes the result by as much as the error that remains.
+    """
+    method = kicked.method
+    if not isinstance(method, WhereSwitched):
+        return 0.0
+    around = np.maximum(fine.brackets + p_step * np.array([-1.0, 1.0]), 0.0)
+    unknown = np.full(around.shape, Verdict.UNDECIDED)
+    coarse, _ = kicked._replace(method=WhereSwitched(method.solver, 2 * method.dt)).narrowed(around, unknown, tolerance)
+    return np.where(np.isnan(fine.low), 0.0, np.abs(coarse.middle - fine.middle))
+
+
+def _energies_of_the_kick(kicked: Kicked, p: Float[np.ndarray, " r"]) -> dict[str, Float[np.ndarray, " r"]]:
     """The energy of the vibration at the end of each kick, and the work of the kick, in J."""
-    known = np.flatnonzero(np.isfinite(columns["p"]))
-    start, duration = (np.asarray(columns.get(name, scene.parameters[name])) for name in ("start", "duration"))
-    energies = {name: np.full(len(columns["p"]), np.nan) for name in ("critical_energy", "kick_work")}
-    if len(known):
-        outcome = run(
-            values={name: column[known] for name, column in columns.items()},
-            method=method,
-            limits=Limits(float(np.max(start + duration)), energy=True),
-            label="energy",
-        )
+    known = np.isfinite(p)
+    start, duration = (
+        np.asarray(kicked.columns.get(name, kicked.scene.parameters[name])) for name in ("start", "duration")
+    )
+    energies = {name: np.full(len(p), np.nan) for name in ("critical_energy", "kick_work")}
+    if np.any(known):
+        limits = Limits(float(np.max(start + duration)), energy=True)
+        outcome = kicked.only(known)._replace(limits=limits).run(p[known, None], "energy")
         energies["critical_energy"][known] = outcome.energy["kick_energy"]
         energies["kick_work"][known] = outcome.energy["kick_work"]
     return energies
 
 
-def _verdicts(run, method, columns: dict[str, np.ndarray], p: np.ndarray, label: str) -> np.ndarray:
-    """Verdicts for each row of the columns at its own values of p (rows, kicks)."""
-    values = {name: np.repeat(column, p.shape[1]) for name, column in columns.items()}
-    found = run(values={**values, "p": p.ravel()}, method=method, label=label)
-    return found.verdict.reshape(p.shape)
-
-
-def _to_narrow(scan: np.ndarray, verdicts: np.ndarray, seen: FirstCrossing) -> tuple[np.ndarray, np.ndarray]:
-    """The brackets (rows, 2) to be narrowed, and the verdicts of the scan at their ends. If already the first kick leads to a
-    limit cycle, the bracket is the first step.
-    """
-    from_the_start = np.isnan(seen.low) & np.isfinite(seen.middle)
-    brackets = np.where(from_the_start[:, None], scan[:2], seen.brackets)
-    ends = np.array([Verdict.SLIDING, Verdict.LIMIT_CYCLE])
-    return brackets, np.where(from_the_start[:, None], verdicts[:, :2], ends)
-
-
-def _hidden(scan: np.ndarray, verdicts: np.ndarray, seen: FirstCrossing) -> np.ndarray:
-    """Whether undecided kicks outside the bracket might hide another change."""
-    inside, no_kick = (scan > seen.low[:, None]) & (scan < seen.high[:, None]), scan == 1.0
-    return np.any((verdicts < 0) & ~inside & ~no_kick, axis=1)
-
-
-def _narrowed(
-    run,
-    method,
-    columns: dict[str, np.ndarray],
-    brackets: np.ndarray,
-    at_ends: np.ndarray,
-    tolerance: float,
-    rounds: int | None = None,
-) -> tuple[FirstCrossing, np.ndarray]:
-    """The crossings inside brackets, narrowed to the tolerance, or to where undecided trajectories stop the narrowing; in so
-    many `rounds` at most.
-
-    The first ends of each bracket are run again, so that both ends of the returned crossing are verdicts of trajectories from
-    the narrowing. Second result: which rows have a verdict that contradicts `at_ends` (rows, 2). Of two different verdicts on
-    the same kick one is false, so no crossing is stated there.
-    """
-    # Points inside a bracket that are tried at once: with more points there are fewer rounds, and rounds take the time.
-    points_per_round = 15
-    nothing = np.full(len(brackets), np.nan)
-    found = FirstCrossing(nothing, nothing.copy(), nothing.copy(), np.zeros(len(brackets), int))
-    contradicted = np.zeros(len(brackets), bool)
-    brackets = brackets.copy()
-    open_ = np.flatnonzero(np.isfinite(brackets).all(axis=1))
-    round_ = 0
-    while len(open_) and round_ != rounds:
-        round_ += 1
-        shares = np.linspace(0, 1, points_per_round + 2)
-        p = brackets[open_, :1] + shares * np.diff(brackets[open_])
-        chosen = {name: column[open_] for name, column in columns.items()}
-        label = f"narrowing {round_}"
-        if round_ == 1:
-            verdicts = _verdicts(run, method, chosen, p, label)
-            before, again = at_ends[open_], verdicts[:, [0, -1]]
-            contradicted[open_] = np.any((before >= 0) & (again >= 0) & (before != again), axis=1)
-        else:
-            verdicts = with_ends(_verdicts(run, method, chosen, p[:, 1:-1], label))
-        now = first_crossings(p, verdicts)
-        still = []
-        for row, place in enumerate(open_):
-            width = now.high[row] - now.low[row]
-            narrower = round_ == 1 or width < 0.9 * (brackets[place, 1] - brackets[place, 0])
-            for whole, part in zip(found, now, strict=True):
-                whole[place] = part[row]
-            if np.isfinite(width):
-                brackets[place] = now.low[row], now.high[row]
-            if narrower and width > tolerance and not contradicted[place]:
-                still.append(place)
-        open_ = np.array(still, int)
-    # Two kicks that are neighbours in rounding cannot come closer.
-    close = found.high - found.low <= np.maximum(tolerance, np.spacing(found.high))
-    middle = np.where(close, 0.5 * (found.low + found.high), found.middle)
-    middle = np.where(~close & np.isfinite(found.low), np.nan, middle)
-    found = found._replace(
-        middle=np.where(contradicted, np.nan, middle), high=np.where(contradicted, np.nan, found.high)
-    )
-    return found, contradicted
+def _over_axes(axes: dict[str, np.ndarray], found: dict[str, np.ndarray], scene: Scene) -> xr.Dataset:
+    """What was found of each row, over the axes; what has one more axis, also over the parameters of derivatives."""
+    shape = tuple(len(values) for values in axes.values())
+    named = {1: tuple(axes), 2: (*axes, "parameter")}
+    variables = {
+        name: (named[values.ndim], values.reshape(*shape, *values.shape[1:])) for name, values in found.items()
+    }
+    parameters = {"parameter": list(differentiable(scene))} if "d_p_crit" in found else {}
+    return xr.Dataset(variables, coords={**axes, **parameters})

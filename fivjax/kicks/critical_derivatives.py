@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 from ..maps.crossing import FirstCrossing
 from ..model.scene import Scene
-from ..verdicts.verdict import Verdict
+from .narrowing import AT_ENDS, Kicked
 from .stable_manifold import Critical, critical_kick
 from .touching import GrazingKick, grazing_kick
 
@@ -31,44 +31,40 @@ def differentiable(scene: Scene) -> tuple[str, ...]:
 
 
 def with_derivatives(
-    scene: Scene, verdicts, columns: dict[str, np.ndarray], found: FirstCrossing, narrowed: Narrowed | None
+    kicked: Kicked, found: FirstCrossing, narrowed: Narrowed
 ) -> tuple[FirstCrossing, dict[str, np.ndarray]]:
     """The crossings, by Newton's method where it finds them; and kind, derivatives and reasons for each row.
 
-    `verdicts(columns, kicks, label)` gives the verdicts of rows at their own values of p; `narrowed(rows, found)` the crossings
-    of those rows in narrower brackets, for where Newton's method does not find them from these.
+    `narrowed(rows, found)` gives the crossings of those rows in narrower brackets, for where Newton's method does not find them
+    from these.
     """
-    names, rows = differentiable(scene), len(found.middle)
+    names, rows = differentiable(kicked.scene), len(found.middle)
     kind, why = np.full(rows, KINDS[0], dtype="<U8"), np.full(rows, NO_CHANGE, dtype=object)
     slopes, trajectories = np.full((rows, len(names)), np.nan), np.zeros(rows, int)
     middle, low, high = found.middle.copy(), found.low.copy(), found.high.copy()
     left = np.flatnonzero(np.isfinite(found.low) & np.isfinite(found.high))
     why[left] = NO_SADDLE
     # A motion that passes no saddle, or one that is not on the boundary, may just touch another contact mode.
-    attempts = [(KINDS[1], critical_kick), (KINDS[2], grazing_kick)]
-    if narrowed is not None:
-        attempts.insert(0, attempts[0])
+    attempts = [(KINDS[1], critical_kick), (KINDS[1], critical_kick), (KINDS[2], grazing_kick)]
     for attempt, (name, method) in enumerate(attempts):
-        if attempt == 1 and narrowed is not None and len(left):
+        if attempt == 1 and len(left):
             finer = narrowed(left, found)
             middle[left], low[left], high[left] = finer.middle, finer.low, finer.high
             left = left[np.isfinite(finer.low) & np.isfinite(finer.high)]
             why[left] = NO_SADDLE
         critical: dict[int, Critical | GrazingKick] = {}
         for row in left:
-            here = scene.replace(**{key: float(column[row]) for key, column in columns.items()})
+            here = kicked.scene.replace(**{key: float(column[row]) for key, column in kicked.columns.items()})
             answer = method(here, (low[row], high[row]), names)
             # In a wide bracket another crossing may be near, which is not the first.
-            narrow = narrowed is None or attempt > 0
-            if answer is not None and (narrow or low[row] <= answer.p <= high[row]):
+            if answer is not None and (attempt > 0 or low[row] <= answer.p <= high[row]):
                 critical[row] = answer
         known = np.array(list(critical), int)
         if not len(known):
             continue
         exact = np.array([critical[row].p for row in known])
         beside = exact[:, None] * (1 + BESIDE * np.array([-1.0, 1.0]))
-        chosen = {key: column[known] for key, column in columns.items()}
-        proved = np.all(verdicts(chosen, beside, "both sides") == [Verdict.SLIDING, Verdict.LIMIT_CYCLE], axis=1)
+        proved = np.all(kicked.only(known).verdicts(beside, "both sides") == AT_ENDS, axis=1)
         why[known[~proved]] = NOT_PROVED
         held = known[proved]
         kind[held], why[held], middle[held] = name, "", exact[proved]

@@ -10,7 +10,7 @@ from fivjax import cli
 # What compiles: the functions that the public ones call once their arguments are checked.
 ENGINES = (
     "fivjax.maps.bistability.run_to_verdict",
-    "fivjax.kicks.critical.run_to_verdict",
+    "fivjax.kicks.narrowing.run_to_verdict",
     "fivjax.simulation.trajectory.rows_in_parts",
     "fivjax.simulation.trajectory.rows_by_kernel",
     "fivjax.calibration.fit.misfit_of_waveform",

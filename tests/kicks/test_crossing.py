@@ -7,7 +7,7 @@ import pytest
 
 import fivjax as fj
 from fivjax.foundation import progress
-from fivjax.kicks import critical
+from fivjax.kicks import narrowing
 from fivjax.maps import bistability, jobs
 from fivjax.maps.crossing import first_crossings
 from fivjax.maps.results import count_of, not_run
@@ -56,7 +56,7 @@ def test_a_map_draws_no_boundary_across_undecided_trajectories(paper_scene, monk
 
 
 def found_by(monkeypatch, paper_scene, verdict_of, **options):
-    monkeypatch.setattr(critical, "run_to_verdict", told(verdict_of))
+    monkeypatch.setattr(narrowing, "run_to_verdict", told(verdict_of))
     return fj.critical_perturbation(paper_scene, p_range=(1.0, 3.0), p_step=0.1, **options).isel(belt_speed=0)
 
 
