@@ -13,7 +13,8 @@ from ..foundation.carried import depending_on
 from ..foundation.polynomial import value_and_rate
 from ..io.recordings import QUANTITIES, Channel
 from ..kernels.functions import KernelFunction
-from ..model.scene import Scene, steady_sliding
+from ..model.scene import Scene
+from ..section.about_sliding import sliding_state
 from ..simulation.jump_instants import load_from, next_jump, start_of_run
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.core import end_after, next_part
@@ -113,8 +114,7 @@ def _sample(args, instants: Float[Array, " q"]):
     at_rest = y0 is None
     start = jax.lax.stop_gradient(jnp.minimum(edge, 0.0)) if at_rest else jnp.zeros_like(edge)
     if at_rest:
-        q, _ = steady_sliding(scene, scene.load.force)
-        y0 = jnp.concatenate([q, jnp.zeros_like(q)])
+        y0 = sliding_state(scene, scene.load.force)
     contact = status_from_forces(mechanics, load_from(scene.load, start), y0)
     first = start_of_run(scene, mechanics, contact, y0, start)
 

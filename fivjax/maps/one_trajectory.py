@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .. import contact as physics
 from ..contact import Contact, State
 from ..model.load import AbstractLoad
-from ..model.scene import Scene, steady_sliding
+from ..model.scene import Scene
+from ..section.about_sliding import sliding_state
 from ..simulation.ending import UNBOUNDED_FROM
 from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
 from ..simulation.jump_instants import next_jump
@@ -91,8 +92,7 @@ def begin(scene: Scene, shared: GroupConstants, initial, *, energy: bool = False
     instead, where that is given and not NaN.
     """
     modes = shared.modes
-    q, _ = steady_sliding(scene, scene.load.force)
-    equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
+    equilibrium = sliding_state(scene, scene.load.force)
     loads = _load_steps(scene.load)
     # With a rounding error added, as in a computed equilibrium: else an unstable one would never be left without a kick.
     y = equilibrium - modes.linear.equilibrium + _started_by(scene, loads) * jnp.abs(equilibrium)
