@@ -4,14 +4,17 @@ xarray is imported where a dataset is made or opened, never before: `import fivj
 """
 
 import json
+import threading
 from collections.abc import Collection, Iterable
 from datetime import UTC, datetime
 from importlib import metadata
 from io import BytesIO
+from numbers import Number
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
+import numpy as np
 
 from ..foundation import arguments
 from ..foundation.quantities import QUANTITIES as QUANTITIES
@@ -87,8 +90,8 @@ def save(result, path: str | Path) -> Path:
 
     **Returns:** the path.
 
-    **Raises:** `TypeError` for an object that is no result, `ValueError` for a path that cannot be written or leads to no
-    file (a folder, a device, a FIFO), `OSError` if the disk is full.
+    **Raises:** `TypeError` for an object that is no result, or has an attribute that no file holds; `ValueError` for a path
+    that cannot be written or leads to no file (a folder, a device, a FIFO); `OSError` if the disk is full.
 
     **Example:**
 
@@ -102,10 +105,9 @@ def save(result, path: str | Path) -> Path:
             f"formats are written by xarray: `fj.open(…).to_zarr(…)`, or for some variables "
             f"`fj.open(…)[['verdict', 'amplitude']].to_dataframe().to_csv(…)`."
         )
+    _check_attributes(dataset)
     # Made in memory first: on a full disk HDF5 crashes the whole process.
-    content = BytesIO()
-    dataset.to_netcdf(content, engine="h5netcdf")
-    return replace_whole(path, content.getvalue())
+    return replace_whole(path, netcdf_of(dataset))
 
 
 def open(path: str | Path) -> "xr.Dataset":
@@ -145,6 +147,31 @@ def open(path: str | Path) -> "xr.Dataset":
         return xr.decode_cf(xr.Dataset(variables, attrs=attributes)).load()
     except Exception as error:
         raise unreadable(path, "NetCDF", f"{error or type(error).__name__}") from None
+
+
+def _check_attributes(dataset: "xr.Dataset") -> None:
+    held = str | bytes | Number | np.ndarray | np.generic | list | tuple
+    variables = ((f"variable `{name}`", variable.attrs) for name, variable in dataset.variables.items())
+    for of, attributes in (("result", dataset.attrs), *variables):
+        for name, value in attributes.items():
+            if not isinstance(value, held) or isinstance(value, bool | np.bool):
+                raise TypeError(
+                    f"Attribute `{name}` of the {of} must be a text or numbers, but is {arguments.describe(value)}."
+                )
+
+
+def netcdf_of(dataset: "xr.Dataset") -> bytes:
+    """The content of a NetCDF file with this dataset."""
+    from xarray.backends import H5NetCDFStore
+
+    content = BytesIO()
+    # Beside a Dask client xarray would take a lock of the cluster's, which cannot be sent a file in memory.
+    store = H5NetCDFStore.open(content, mode="w", lock=threading.Lock())
+    try:
+        dataset.load().dump_to_store(store)
+    finally:
+        store.close()
+    return content.getvalue()
 
 
 def _as_dataset(result) -> "xr.Dataset":

@@ -22,6 +22,7 @@ import numpy as np
 
 from ..attractors.catalogue import Attractors
 from ..foundation.seals import Damaged, sealed, unsealed
+from ..io.datasets import netcdf_of
 from ..io.files import check_writable, replace_whole
 from ..verdicts.verdict import Verdict
 from .job_files import attractors_from_bytes, attractors_to_bytes, file_of, runs_of
@@ -258,9 +259,7 @@ def contents_to_bytes(run: dict, results: dict[str, np.ndarray], found: Mapping[
 
     dataset = xr.Dataset({name: ("trajectory", values) for name, values in results.items()})
     dataset.attrs.update(kind=KIND, run=json.dumps(run))
-    content = BytesIO()
-    dataset.to_netcdf(content, engine="h5netcdf")
-    data = content.getvalue()
+    data = netcdf_of(dataset)
     with h5py.File(BytesIO(data)) as file:
         places = {name: file[name].id.get_offset() for name in results}
     arrays = {

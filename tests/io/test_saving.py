@@ -258,6 +258,15 @@ def test_a_scene_prints_its_values(run):
     assert same(rebuilt, run.scene)
 
 
+@pytest.mark.parametrize("value", [None, True, {"a": 1}])
+def test_what_no_file_holds_is_refused_by_name(tmp_path, value):
+    """Rejects what ended in an error of h5py's that names no attribute."""
+    data = xr.Dataset({"v": ("x", np.ones(2), {"own": value})})
+    with refused(TypeError, "`own`", "variable `v`"):
+        fj.save(data, tmp_path / "own.nc")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_parameter_of_a_structure_is_none_of_a_law_that_does_without(tmp_path):
     """`Coulomb` has an optional `mu_static`: a scene that comes back must not find it in the structure."""
 
