@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
-from ..io.datasets import labelled
+from ..io.datasets import labelled, unit_of
 from ..io.recordings import Recording
 from ..model.scene import Scene
 from .covariance import combinations
@@ -147,7 +147,10 @@ class Calibration(eqx.Module):
     __repr__ = __str__
 
     def to_dataset(self) -> xr.Dataset:
-        """Parameters with uncertainties, and the data and the fit of recording r over `t_r` and `channel_r`."""
+        """Parameters with uncertainties, each with its `unit`; time offsets by recording, NaN where none was fitted; and the
+        data and the fit of recording r over `t_r` and `channel_r`, the channels with their `unit_r`.
+        """
+        offsets = np.array([(np.nan, np.nan) if offset is None else offset for offset in self.offsets]).reshape(-1, 2)
         dataset = xr.Dataset(
             {
                 "value": ("parameter", np.array(list(self.values.values()))),
@@ -156,17 +159,39 @@ class Calibration(eqx.Module):
                 "estimate": ("parameter", self.estimates),
                 "correlation": (("parameter", "other"), self.correlation),
                 "singular_value": ("direction", self.singular_values),
+                "offset": ("recording", offsets[:, 0]),
+                "offset_uncertainty": ("recording", offsets[:, 1]),
             },
-            coords={"parameter": list(self.names), "other": list(self.names)},
+            coords={
+                "parameter": list(self.names),
+                "other": list(self.names),
+                "unit": ("parameter", list(map(unit_of, self.names))),
+            },
         )
         for k, recording in enumerate(self.recordings):
             dims = (f"t_{k}", f"channel_{k}")
             dataset[f"measured_{k}"] = (dims, self.measured[k])
             dataset[f"fitted_{k}"] = (dims, self.fitted[k])
             dataset = dataset.assign_coords(
-                {dims[0]: self.t[k], dims[1]: [str(channel) for channel in recording.channels]}
+                {
+                    dims[0]: self.t[k],
+                    dims[1]: [str(channel) for channel in recording.channels],
+                    f"unit_{k}": (dims[1], [unit_of(channel.quantity) for channel in recording.channels]),
+                }
             )
             dataset[f"measured_{k}"].attrs.update(regime=recording.regime, sampling=recording.sampling)
         dataset = labelled(dataset, self.scene)
+        for k in range(len(self.recordings)):
+            dataset[f"t_{k}"].attrs.update(long_name=f"time, recording {k}")
+            dataset[f"measured_{k}"].attrs.update(long_name=f"measured, recording {k}")
+            dataset[f"fitted_{k}"].attrs.update(long_name=f"fitted, recording {k}")
+        for name, what in {
+            "value": "value",
+            "uncertainty": "standard deviation",
+            "estimate": "value at the end",
+        }.items():
+            dataset[name].attrs.update(long_name=f"{what} of the parameter, in its unit")
+        for name, what in {"offset": "time offset", "offset_uncertainty": "standard deviation of it"}.items():
+            dataset[name].attrs.update(long_name=what, units="s")
         dataset.attrs.update(outcome=str(self.outcome), misfit=self.misfit, what_is_left=str(self.left))
         return dataset

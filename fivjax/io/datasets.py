@@ -33,12 +33,24 @@ if TYPE_CHECKING:
 
 def label(variable: "xr.DataArray") -> "xr.DataArray":
     """The variable with its long name and unit; that of one of several contacts has the contact's number behind its name."""
-    name = str(variable.name)
-    quantity, contact = (name, "") if name in QUANTITIES else name.rpartition("_")[::2]
-    if quantity in QUANTITIES and (not contact or contact.isdecimal()):
-        long_name, unit = QUANTITIES[quantity]
-        variable.attrs.update(long_name=f"{long_name}, contact {contact}" if contact else long_name, units=unit)
+    if (known := _quantity(str(variable.name))) is not None:
+        variable.attrs.update(zip(("long_name", "units"), known, strict=True))
     return variable
+
+
+def unit_of(name: str) -> str:
+    """The unit of a parameter or result; "" for one that fivjax does not name."""
+    known = _quantity(name)
+    return "" if known is None else known[1]
+
+
+def _quantity(name: str) -> tuple[str, str] | None:
+    """The long name and the unit of a parameter or result."""
+    quantity, contact = (name, "") if name in QUANTITIES else name.rpartition("_")[::2]
+    if quantity not in QUANTITIES or (contact and not contact.isdecimal()):
+        return None
+    long_name, unit = QUANTITIES[quantity]
+    return (f"{long_name}, contact {contact}" if contact else long_name), unit
 
 
 def labelled(dataset: "xr.Dataset", scene: Scene, **settings) -> "xr.Dataset":

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from ..calibration.result import Calibration
 from ..foundation import arguments
-from ..foundation.quantities import QUANTITIES
+from ..io.datasets import unit_of
 from .style import BLACK, SKY, VERMILION, new_figure
 
 MEASURED, FITTED, LEFT = SKY, BLACK, VERMILION
@@ -41,8 +41,8 @@ def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
         part.set_xlabel("time (s)")
     lines = []
     for name in fit.names:
-        unit = QUANTITIES.get(name, ("", "1"))[1]
-        unit = "" if unit == "1" or not fit.identifiable[name] else f" {unit}"
+        unit = unit_of(name)
+        unit = "" if unit in ("", "1") or not fit.identifiable[name] else f" {unit}"
         lines.append(f"{name} = {fit.value_text(name)}{unit}")
     figure.suptitle("\n".join([str(fit.outcome).split(":")[0], *lines]), ha="left", x=0.02, fontsize="small")
     return figure

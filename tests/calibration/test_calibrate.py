@@ -356,6 +356,9 @@ def test_result_is_written_and_drawn(decay_fit, tmp_path):
         assert list(dataset["parameter"].values) == FREE[3]
         np.testing.assert_array_equal(dataset["value"], list(decay_fit.values.values()))
         assert dataset.attrs["outcome"] == "converged"
+        assert dataset["unit"].values.tolist() == ["1", "N s/m", "N/m"] and set(dataset["unit_0"].values) == {"m/s2"}
+        assert dataset["t_0"].attrs == {"long_name": "time, recording 0", "units": "s"}
+        np.testing.assert_array_equal(dataset["offset"], decay_fit.offsets[0][:1] if decay_fit.offsets[0] else [np.nan])
     figure = calibration(decay_fit)
     detail = figure.axes[0]
     np.testing.assert_array_equal(detail.lines[1].get_ydata(), decay_fit.fitted[0][:160, 0])
