@@ -272,8 +272,9 @@ def _closed_from(scene: Scene, start) -> LimitCycle | None:
 
 def _guess(maps: ReturnMaps, scene: Scene, start) -> tuple[Point, list[int]]:
     """A point of the section to begin at, and the numbers of crossings per period to try."""
-    status, direction, only = None, None, np.zeros(1, int)
+    status, direction, only, own = None, None, np.zeros(1, int), 0
     if isinstance(start, LimitCycle):
+        own = start.crossings if start.kind == "periodic" else 0
         # The point of the other scene's cycle need not be on this scene's section, if an impact falls on the section.
         status, direction = start.contact.status, start.contact.direction
         start = np.asarray(sliding_state(scene, scene.load.final)) + start.deviation
@@ -294,9 +295,11 @@ def _guess(maps: ReturnMaps, scene: Scene, start) -> tuple[Point, list[int]]:
             direction = np.where((known == Status.SLIDE) & (slip != 0), np.sign(slip), 1.0)
         at = at._replace(status=known.reshape(at.status.shape), direction=np.reshape(direction, at.direction.shape))
     first = maps.returns(only, at, 1).at
-    _, path = maps.path(only, first, MOST_CROSSINGS)
+    _, path = maps.path(only, first, max(own, MOST_CROSSINGS))
     path = maps.weights * path[0]
     if not np.all(np.isfinite(path)):
         raise NoLimitCycle("No limit cycle was met from `start`: the motion stops crossing the section.")
     back = np.linalg.norm(path - maps.weights * first.y, axis=1)
-    return first.point(0), [int(k) + 1 for k in np.argsort(back, kind="stable")[:4]]
+    nearest = [int(k) + 1 for k in np.argsort(back, kind="stable")[:4]]
+    # Among so many, another return may come nearer by chance.
+    return first.point(0), [own, *nearest] if own > MOST_CROSSINGS else nearest

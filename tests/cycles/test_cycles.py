@@ -370,6 +370,9 @@ def test_a_locked_torus_is_named_as_the_cycle_that_it_is():
     path = np.asarray(structure.weights) * cycle.points
     apart = np.linalg.norm(path[:, None] - path, axis=-1)[np.triu_indices(len(path), 1)]
     assert len(path) == 13 and apart.min() > 0.01 * apart.max()
+    # It may be started from, however many returns it has.
+    again = fj.limit_cycle(scene, start=cycle)
+    assert again.crossings == 13 and again.period == pytest.approx(cycle.period, rel=1e-12)
 
 
 @pytest.mark.slow
