@@ -54,6 +54,7 @@ class _Guards(NamedTuple):
     bound_2: Float[Array, " g"]
     bound_3: Float[Array, " g"]
     largest_3: Float[Array, " g"]
+    over_bound_3: Float[Array, " g"]  # one over the second of these
 
 
 def march_to_roots(
@@ -65,11 +66,12 @@ def march_to_roots(
 ) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
     r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
 
-    The negative coefficients alone bound it from below: there is no root before the first coefficient is used up by their sum.
-    From there it marches by steps d in which no root is possible. They bound the second and the third derivative, too: by
-    $-B_2$ and $-B_3$. So up to a distance D there is $g + g' d - B d^2 / 2 > 0$ with $B = \min(B_2, B_3 D / 3 - g'')$; with
-    $D = 2 g / |g'|$ the march converges cubically near a simple root. No root is skipped, and a dip below zero inside the
-    interval is found at its first crossing.
+    The negative coefficients alone bound it from below: where $c_0$ to $c_k$ are not negative, there is no root before $c_k$ is
+    used up by their sum. From there it marches by steps d in which no root is possible. They bound the second and the third
+    derivative, too: by $-B_2$ and $-B_3$. So up to a distance D there is $g + g' d - B d^2 / 2 > 0$ with
+    $B = \min(B_2, B_3 D / 3 - g'')$; with $D = 2 g / |g'|$ the march converges cubically near a simple root. Where g rises, it
+    is not lower up to $d = 3 g'' / B_3$: steps grow on the way from where it and its derivatives are next to zero. No root is
+    skipped, and a dip below zero inside the interval is found at its first crossing.
 
     A root at zero, where the status began, does not count; with an `exact` start, a small value there is no rounding error.
     What is small is told on [0, `near`]: over a long time a straight motion makes any value at the start small. A march that
@@ -115,14 +117,17 @@ def _from_start(
     powers = jnp.stack([near**j * jnp.ones_like(size) for j in range(3)])
     zero = zero_at_start(first * powers, of_near, rounding * powers, exact)
     first = jnp.where(jnp.stack(zero), 0.0, first)
-    lead = first[0]
+    lead, largest, none_falls = first[0], first[0], first[0] >= 0
     for own in (first[1], first[2], *later[:2]):
         lead = jnp.where(lead == 0, own, lead)
+        none_falls = none_falls & (own >= 0)
+        largest = jnp.where(none_falls, jnp.maximum(largest, own), largest)
     # The sums of negative coefficients alone are half of the difference of both.
     falling = 0.5 * (sizes - sums) + jnp.tensordot(weights[:, :3], jnp.maximum(-first, 0.0), 1)
     spent, scale = lead < 0, ratio(1.0, size, 0.0)
-    begin = jnp.where(spent, 0.0, jnp.minimum(ratio(lead, falling[0], 1.0), 1.0))
-    bounds = scale * falling[1], scale * falling[2], scale * sizes[2]
+    begin = jnp.where(spent, 0.0, jnp.minimum(ratio(largest, falling[0], 1.0), 1.0))
+    bound_3 = scale * falling[2]
+    bounds = scale * falling[1], bound_3, scale * sizes[2], ratio(1.0, bound_3, jnp.inf)
     return _Guards(jnp.concatenate([first, later]), begin, spent, scale, *bounds)
 
 
@@ -141,6 +146,7 @@ def _further(
     under_root = jnp.where(falls, jnp.minimum(by_third, by_second), steep + 2 * bound * value)
     root = jnp.sqrt(jnp.maximum(under_root, 0.0))
     step = ratio(jnp.where(falls, -2 * value * slope, slope + root), jnp.where(falls, steep + root, bound), 1.0)
+    step = jnp.where(falls, step, jnp.maximum(step, jnp.where(bend > 0, bend * guards.over_bound_3, 0.0)))
     inside = step < far
     x = jnp.where(inside, x + step, until)
     # After a step that ends at the root but for rounding, none more is needed to see it.

@@ -340,6 +340,15 @@ def differs_from_differences(scene, t1):
     return found, worst
 
 
+@pytest.mark.parametrize("apart", [1e-7, 1e-5])
+def test_contacts_that_lift_off_within_an_instant_of_each_other_go_on(apart):
+    """A step that began with a gap of 1e-31 m went on for 1e-19 s, and so did all later ones."""
+    run = fj.simulate(spring_coupled((1.0, 1.0 + apart)), 0.2, 0.2)
+    assert run.outcome == fj.Ending.FINISHED, run.meaning
+    alike = np.abs(run.velocity[-1, 3:] - run.velocity[-1, :3]).max()
+    assert alike < 1e3 * apart * np.abs(run.velocity[-1]).max()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("second", [1.0, 1.0 + 1e-7, 1.1], ids=["simultaneous", "neighbouring", "apart"])
 def test_derivatives_through_events_of_two_contacts_that_fall_together(second):

@@ -281,18 +281,37 @@ def test_the_first_of_several_series_that_begin_at_zero_to_run_out_is_found():
     assert found > 200 and none > 20 and given_up < 5
 
 
+@pytest.mark.parametrize("size", [1e-3, 1e-9, 1e-14])
+def test_a_series_next_to_zero_with_its_derivatives_is_left_behind(size):
+    """As a gap is that opened an instant ago, by a force that grows: (u³ - b u + a) size³ with x = size u, beside higher terms."""
+    from fivjax.steppers.guard_roots import march_to_roots
+
+    with jax.enable_x64(True):
+        march = jax.jit(march_to_roots)
+        # Rising; dipping, but not to zero; to zero, which is the first root.
+        for below, rest in ((-1.0, 1.0), (1.0, 0.4), (1.0, 0.38)):
+            c = np.array([rest * size**3, -below * size**2, 0.0, 1.0, -1.5])
+            x, fires = march(jnp.asarray(c[:, None]), exact=jnp.array([True]))
+            roots = np.roots([-1.5 * size, 1.0, 0.0, -below, rest])
+            first = np.min(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real) * size
+            # Where steps are used up on the way, it has left behind what it began in.
+            assert x.item() == pytest.approx(first, rel=1e-9) if fires.item() else 1e6 * size < x.item() < first
+
+
 def test_only_what_ends_the_advance_stops_the_march_along_others():
     """Velocity that falls through the section is no event: a guard that runs out later is still found."""
     from fivjax.steppers.guard_roots import march_to_roots
 
     with jax.enable_x64(True):
-        c = jnp.array([[0.2, 0.3], [2.0, -1.0], [-4.0, 0.0]])
-        late, soon = (1 + np.sqrt(1.8)) / 4, 0.3
+        # (0.7 - x) (1 - x + x²)³, and 0.3 - x.
+        slow = np.polynomial.Polynomial([0.7, -1.0]) * np.polynomial.Polynomial([1.0, -1.0, 1.0]) ** 3
+        c = jnp.stack([slow.coef, np.pad([0.3, -1.0], (0, len(slow.coef) - 2))], axis=1)
+        late, soon = 0.7, 0.3
         x, fires = jax.jit(march_to_roots)(c, ends=jnp.array([True, False]))
         np.testing.assert_allclose(x, [late, soon], rtol=1e-14)
         assert fires.tolist() == [True, True]
         x, fires = jax.jit(march_to_roots)(c, ends=jnp.array([True, True]))
-        assert fires.tolist() == [False, True] and x[1] == pytest.approx(soon, rel=1e-15) and x[0] < 0.31
+        assert fires.tolist() == [False, True] and x[1] == pytest.approx(soon, rel=1e-15) and x[0] < 0.6
 
 
 def test_a_step_clipped_to_any_length_is_exact(paper_scene):
