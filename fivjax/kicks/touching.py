@@ -8,9 +8,11 @@ friction cone) just touches zero,
 $$ g(p, t) = 0, \qquad \frac{∂g}{∂t}(p, t) = 0, $$
 
 after a given number of events. The motion in one contact mode can be continued smoothly where its guard is negative, so this is
-a simple root, and because $∂g/∂t$ is zero there, $dp/dθ = -g_θ / g_p$.
+a simple root, and because $∂g/∂t$ is zero there, $dp/dθ = -g_θ / g_p$. Or the guard is lowest as the kick ends, where the jump
+of the load makes a corner in it: then $g(p, t) = 0$ at that instant, which moves with the duration.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -76,7 +78,8 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
         parting = _parting(below, above, TOGETHER * period)
         if parting is None:
             return found
-        found = _touched(scene, stepper, directions, names, (low, high), parting, period)
+        touch = scene, stepper, directions, names, (low, high), parting, period
+        found = _touched(*touch) or _touched_as_the_kick_ends(*touch)
         if found is None:
             return None
         # Another oscillation may come closer and touch already at a smaller kick.
@@ -114,6 +117,41 @@ def _touched(
             slopes = {name: float(-of_parameters[k + 1] / of_parameters[0]) for k, name in enumerate(names)}
             return GrazingKick(float(p), slopes, taken, time, place)
         p, time = p + step, time + shift
+    return None
+
+
+def _touched_as_the_kick_ends(
+    scene: Scene,
+    stepper: EventExact,
+    directions: Scene,
+    names: tuple[str, ...],
+    bracket: tuple[float, float],
+    parting: tuple[int, float, int],
+    period: float,
+) -> GrazingKick | None:
+    """Newton's method in the kick alone, for a guard that is lowest at the end of the pulse."""
+    # Newton's method has converged if its step is below this, relative to p; so far from the end it is looked at whether the
+    # guard falls before and rises behind, relative to the duration.
+    exact_p, beside = 1e-13, 1e-9
+    (place, time, guard), (low, high), end = parting, bracket, float(scene.parameters["duration"])
+    if abs(time - end) > TOGETHER * period:
+        return None
+    # By p and the parameters.
+    with_time = [float(name == "duration") for name in ("p", *names)]
+    p, width = high, high - low
+    for taken in range(1, MOST_ITERATIONS + 1):
+        value, _, slopes = _guard(scene.replace(p=p), stepper, directions, end, place, guard, with_time)
+        if not (np.isfinite([value, slopes[0]]).all() and slopes[0] != 0):
+            return None
+        step = -value / slopes[0]
+        if not low - width <= p + step <= high + width:
+            return None
+        p += step
+        if abs(step) <= exact_p * p:
+            at, both = scene.replace(p=p), (end * (1 - beside), end * (1 + beside))
+            before, after = (_guard(at, stepper, directions, t, place, guard)[1] for t in both)
+            by_name = {name: float(-slope / slopes[0]) for name, slope in zip(names, slopes[1:], strict=True)}
+            return GrazingKick(float(p), by_name, taken, end, place) if before < 0 < after else None
     return None
 
 
@@ -186,18 +224,27 @@ def _find_events(args, _):
 _to_events = KernelFunction(_find_events)
 
 
-def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, events: int, guard: int):
-    """A guard at a time after `events` events, its time derivative, and the derivatives of both along directions of the
-    parameters.
+def _guard(
+    scene: Scene,
+    stepper: EventExact,
+    directions: Scene,
+    time: float,
+    events: int,
+    guard: int,
+    with_time: Sequence[float] | None = None,
+):
+    """A guard at a time after `events` events, its time derivative, and its derivatives along directions of the parameters, in
+    which the time changes by `with_time`.
     """
     args = ByMethod(for_derivatives(stepper)), scene, np.asarray(time), np.int32(events), np.int32(guard)
     count = len(jax.tree.leaves(directions)[0])
+    moves = np.zeros(count) if with_time is None else np.asarray(with_time)
     # By time, then along the directions.
     along = jax.tree.map(
         lambda leaf: np.moveaxis(np.pad(leaf, [(1, 0)] + [(0, 0)] * (leaf.ndim - 1)), 0, -1), directions
     )
     still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), 1 + count)), args)
-    moving = still[0], along, np.eye(1, 1 + count)[0], *still[3:]
+    moving = still[0], along, np.append(1.0, moves), *still[3:]
     by_kernel = has_kernel(scene, stepper)
     (value, _), (slopes, _) = _to_guard.derived(args, moving, by_kernel=by_kernel)
     return float(value), float(slopes[0]), slopes[1:]

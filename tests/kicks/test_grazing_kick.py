@@ -39,6 +39,24 @@ def touching(**changes) -> float:
 
 
 @pytest.mark.slow
+def test_a_kick_that_touches_as_it_ends():
+    """Of a block on a spring the speed is largest at the end of a short kick, not smoothly: v = μ (p - 1) F e^(-δ T) sin(ω T) / ω."""
+    delta, duration, mu, belt_speed = 0.05, 0.5, 0.4, 0.2
+    structure = fj.Structure(
+        np.eye(2), np.diag([2 * delta, 1.0]), np.diag([1.0, 9.0]), [0.0, -1.0], tangential=0, normal=1
+    )
+    scene = fj.Scene(structure, fj.Coulomb(mu, mu_static=0.8), belt_speed, fj.Pulse(1.0, 2.0, duration=duration))
+    rate = np.sqrt(1.0 - delta**2)
+    more = belt_speed * rate * np.exp(delta * duration) / (mu * np.sin(rate * duration))
+    found = grazing_kick(scene, (1.0 + more - 2e-6, 1.0 + more + 3e-6), differentiable(scene))
+    assert found is not None and found.p == pytest.approx(1.0 + more, abs=1e-14) and found.time == duration
+    by_duration = more * (delta - rate / np.tan(rate * duration))
+    expected = {"belt_speed": more / belt_speed, "mu": -more / mu, "force": -more, "duration": by_duration}
+    for name, slope in found.d_p.items():
+        assert slope == pytest.approx(expected.get(name, 0.0), rel=1e-12, abs=1e-14)
+
+
+@pytest.mark.slow
 def test_the_kick_that_touches_is_that_of_linear_sliding():
     """Newton's method on the touching condition, and its derivatives, against matrix exponentials and their differences."""
     names = differentiable(SCENE)
