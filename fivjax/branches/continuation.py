@@ -160,7 +160,8 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     **Arguments:** `branch`, from `continue_cycle`; `i`, the index of the point.
 
     **Returns:** a `LimitCycle`. Where contact modes change, the return map has no derivative, and the multipliers are those of
-    the branch, on one side of that point.
+    the branch, on one side of that point. Where the branch ends because the two halves of its cycle become one, that one is
+    returned, with half of the branch's period.
 
     **Raises:** `TypeError` or `ValueError` for an object that is no branch, an `i` that is not among its points, and a
     structure by a function of your own that has made none in this process;

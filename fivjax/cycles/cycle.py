@@ -191,6 +191,8 @@ class LimitCycle(eqx.Module):
         # So many phases of the word are printed.
         printed_phases = 12
         stability = "stable" if self.stable else f"unstable in {self.unstable_directions} direction(s)"
+        if not self.stable and self.unstable_directions == 0:
+            stability = "at the limit of stability: a second multiplier has the size 1"
         if self.in_family:
             stability = "one of a family: a second multiplier is 1"
         modes = " ".join(
