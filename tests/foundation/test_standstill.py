@@ -182,8 +182,9 @@ from fivjax.foundation.precision import in_double_precision
 from fivjax.steppers.event_exact import EventExact
 from tests.helpers.chains import chain
 scene = chain(24, 1)
-run = in_double_precision(groups._prepare)
-print(np.isfinite(run(scene, EventExact(), ("mu",), np.linspace(0.1, 0.5, 64)[:, None])[-1]).all())
+task = groups.Task(scene, EventExact(), ("mu",), (), {})
+run = in_double_precision(groups.constants_of)
+print(np.isfinite(run(task, np.linspace(0.1, 0.5, 64)[:, None]).tree.longest_return).all())
 """
 MAP = """
 import sys
