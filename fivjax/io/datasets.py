@@ -166,7 +166,7 @@ def _check_attributes(dataset: "xr.Dataset") -> None:
     variables = ((f"variable `{name}`", variable.attrs) for name, variable in dataset.variables.items())
     for of, attributes in (("result", dataset.attrs), *variables):
         for name, value in attributes.items():
-            if not isinstance(value, held) or isinstance(value, bool | np.bool):
+            if not isinstance(value, held) or isinstance(value, bool | np.bool_):
                 raise TypeError(
                     f"Attribute `{name}` of the {of} must be a text or numbers, but is {arguments.describe(value)}."
                 )
@@ -180,7 +180,7 @@ def netcdf_of(dataset: "xr.Dataset") -> bytes:
     # Beside a Dask client xarray would take a lock of the cluster's, which cannot be sent a file in memory.
     store = H5NetCDFStore.open(content, mode="w", lock=threading.Lock())
     try:
-        dataset.load().dump_to_store(store)
+        dataset.compute().dump_to_store(store)
     finally:
         store.close()
     return content.getvalue()
