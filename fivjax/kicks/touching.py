@@ -38,6 +38,8 @@ MOST_EVENTS, MOST_TIME = 1024, 20.0
 # Events of two motions are the same if their times differ by no more than this share of the slowest period.
 TOGETHER = 1e-2
 MOST_ITERATIONS = 20
+# Newton's method has converged if its steps in p are below this, relative to p.
+EXACT_P = 1e-13
 
 
 class GrazingKick(NamedTuple):
@@ -78,8 +80,8 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
         parting = _parting(below, above, TOGETHER * period)
         if parting is None:
             return found
-        touch = scene, stepper, directions, names, (low, high), parting, period
-        found = _touched(*touch) or _touched_as_the_kick_ends(*touch)
+        touch = _Touch(scene, stepper, directions, names, period, (low, high), *parting)
+        found = _touched(touch) or _touched_as_the_kick_ends(touch)
         if found is None:
             return None
         # Another oscillation may come closer and touch already at a smaller kick.
@@ -88,70 +90,77 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
     return None
 
 
-def _touched(
-    scene: Scene,
-    stepper: EventExact,
-    directions: Scene,
-    names: tuple[str, ...],
-    bracket: tuple[float, float],
-    parting: tuple[int, float, int],
-    period: float,
-) -> GrazingKick | None:
+class _Touch(NamedTuple):
+    """What may just touch zero: a guard of the first event that only one of the kicks at the ends of a bracket leads to."""
+
+    scene: Scene
+    stepper: EventExact
+    directions: Scene  # by p, then by the parameters
+    names: tuple[str, ...]  # of the parameters
+    period: float  # the slowest, s
+    bracket: tuple[float, float]  # of p
+    events: int  # before that event
+    time: float  # of the event, s after the kick began
+    guard: int
+
+    def of(self, scene: Scene, time: float, with_time: Sequence[float] | None = None):
+        """`_guard` of the scene at a time."""
+        return _guard(scene, self.stepper, self.directions, time, self.events, self.guard, with_time)
+
+    def is_near(self, p: float) -> bool:
+        """Whether a kick is no further outside of the bracket than that is wide."""
+        low, high = self.bracket
+        return low - (high - low) <= p <= high + (high - low)
+
+    def found(self, p: float, slopes: np.ndarray, taken: int, time: float) -> GrazingKick:
+        """The kick, from the guard's derivatives along the directions."""
+        by_name = {name: float(-slope / slopes[0]) for name, slope in zip(self.names, slopes[1:], strict=True)}
+        return GrazingKick(float(p), by_name, taken, time, self.events)
+
+
+def _touched(touch: _Touch) -> GrazingKick | None:
     """Newton's method in the kick and the time of the touch."""
-    # Newton's method has converged if its steps are below these, relative to p and to the slowest period.
-    exact_p, exact_t = 1e-13, 1e-8
-    (place, time, guard), (low, high) = parting, bracket
-    p, apart, width = high, 1e-4 * period, high - low
+    # The same for the time of the touch, relative to the slowest period.
+    exact_t = 1e-8
+    p, time, apart = touch.bracket[1], touch.time, 1e-4 * touch.period
     for taken in range(1, MOST_ITERATIONS + 1):
-        at = scene.replace(p=p)
-        value, slope, of_parameters = _guard(at, stepper, directions, time, place, guard)
-        before, after = (_guard(at, stepper, directions, time + side * apart, place, guard)[1] for side in (-1, 1))
+        at = touch.scene.replace(p=p)
+        value, slope, of_parameters = touch.of(at, time)
+        before, after = (touch.of(at, time + side * apart)[1] for side in (-1, 1))
         bend = (after - before) / (2 * apart)
         if not (np.isfinite([value, slope, bend, of_parameters[0]]).all() and bend > 0 and of_parameters[0] != 0):
             return None
         shift = -slope / bend
         step = -(value + 0.5 * slope * shift) / of_parameters[0]
-        if not low - width <= p + step <= high + width or abs(shift) > 0.1 * period:
+        if not touch.is_near(p + step) or abs(shift) > 0.1 * touch.period:
             return None
-        if abs(step) <= exact_p * p and abs(shift) <= exact_t * period:
-            slopes = {name: float(-of_parameters[k + 1] / of_parameters[0]) for k, name in enumerate(names)}
-            return GrazingKick(float(p), slopes, taken, time, place)
+        if abs(step) <= EXACT_P * p and abs(shift) <= exact_t * touch.period:
+            return touch.found(p, of_parameters, taken, time)
         p, time = p + step, time + shift
     return None
 
 
-def _touched_as_the_kick_ends(
-    scene: Scene,
-    stepper: EventExact,
-    directions: Scene,
-    names: tuple[str, ...],
-    bracket: tuple[float, float],
-    parting: tuple[int, float, int],
-    period: float,
-) -> GrazingKick | None:
+def _touched_as_the_kick_ends(touch: _Touch) -> GrazingKick | None:
     """Newton's method in the kick alone, for a guard that is lowest at the end of the pulse."""
-    # Newton's method has converged if its step is below this, relative to p; so far from the end it is looked at whether the
-    # guard falls before and rises behind, relative to the duration.
-    exact_p, beside = 1e-13, 1e-9
-    (place, time, guard), (low, high), end = parting, bracket, float(scene.parameters["duration"])
-    if abs(time - end) > TOGETHER * period:
+    # So far from the end it is looked at whether the guard falls before and rises behind, relative to the duration.
+    beside = 1e-9
+    end = float(touch.scene.parameters["duration"])
+    if abs(touch.time - end) > TOGETHER * touch.period:
         return None
-    # By p and the parameters.
-    with_time = [float(name == "duration") for name in ("p", *names)]
-    p, width = high, high - low
+    with_time = [float(name == "duration") for name in ("p", *touch.names)]
+    p = touch.bracket[1]
     for taken in range(1, MOST_ITERATIONS + 1):
-        value, _, slopes = _guard(scene.replace(p=p), stepper, directions, end, place, guard, with_time)
+        value, _, slopes = touch.of(touch.scene.replace(p=p), end, with_time)
         if not (np.isfinite([value, slopes[0]]).all() and slopes[0] != 0):
             return None
         step = -value / slopes[0]
-        if not low - width <= p + step <= high + width:
+        if not touch.is_near(p + step):
             return None
         p += step
-        if abs(step) <= exact_p * p:
-            at, both = scene.replace(p=p), (end * (1 - beside), end * (1 + beside))
-            before, after = (_guard(at, stepper, directions, t, place, guard)[1] for t in both)
-            by_name = {name: float(-slope / slopes[0]) for name, slope in zip(names, slopes[1:], strict=True)}
-            return GrazingKick(float(p), by_name, taken, end, place) if before < 0 < after else None
+        if abs(step) <= EXACT_P * p:
+            at = touch.scene.replace(p=p)
+            before, after = (touch.of(at, end * (1 + side * beside))[1] for side in (-1, 1))
+            return touch.found(p, slopes, taken, end) if before < 0 < after else None
     return None
 
 
