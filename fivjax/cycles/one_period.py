@@ -129,22 +129,22 @@ def word(segments: PeriodSegments) -> tuple[Phase, ...]:
 
     Sliding that reverses its direction is two phases. With several contacts, a phase lasts until the mode of one of them ends.
     """
-    count = len(segments.h)
-    letters: list[tuple[tuple[tuple, tuple], float]] = []
-    for k in range(count):
-        status, direction = (np.atleast_1d(part[k]) for part in (segments.contact.status, segments.contact.direction))
-        key = tuple(status.tolist()), tuple(np.where(status == Status.SLIDE, direction, 0.0).tolist())
-        broken = k > 0 and bool(np.any(segments.ended[k - 1]))
-        duration = float(segments.h[k])
-        if letters and letters[-1][0] == key and not broken:
-            letters[-1] = key, letters[-1][1] + duration
-        elif duration > 0:
-            letters.append((key, duration))
-    if len(letters) > 1 and letters[0][0] == letters[-1][0] and not bool(np.any(segments.ended[count - 1])):
-        letters = [(letters[0][0], letters[0][1] + letters[-1][1]), *letters[1:-1]]
+    lasts = segments.h > 0
+    status, direction = (part.reshape(len(lasts), -1) for part in (segments.contact.status, segments.contact.direction))
+    mode = np.concatenate([status, np.where(status == Status.SLIDE, direction, 0.0)], axis=1)[lasts]
+    # An event between two segments separates them also where the mode is the same: a rebound.
+    ended = np.any(segments.ended.reshape(len(lasts), -1), axis=1)
+    begins = np.any(mode != np.roll(mode, 1, axis=0), axis=1) | np.roll(ended, 1)[lasts]
+    first = np.flatnonzero(begins | (np.arange(len(begins)) == 0))
+    durations = np.add.reduceat(segments.h[lasts], first)
+    if len(first) > 1 and not begins[0]:
+        durations[0] += durations[-1]
+        first, durations = first[:-1], durations[:-1]
+    modes = [tuple(map(Status, row)) for row in status[lasts][first].tolist()]
     several = segments.contact.status.ndim > 1
-    phases = [(tuple(map(Status, status)), duration) for (status, _), duration in letters]
-    return tuple(Phase(modes if several else modes[0], duration) for modes, duration in phases)
+    return tuple(
+        Phase(mode if several else mode[0], duration) for mode, duration in zip(modes, durations.tolist(), strict=True)
+    )
 
 
 def floquet_multipliers(

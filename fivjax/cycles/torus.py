@@ -106,16 +106,12 @@ def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
     angle = np.arctan2(plane[:, 1], plane[:, 0])
     turns = np.diff(np.unwrap(angle)) / (2 * np.pi)
     guess = smooth_mean(turns)
-    k = np.arange(len(weighted))
-
-    def length(rotation: float) -> float:
-        path = weighted[np.argsort(np.mod(rotation * k, 1.0), kind="stable")]
-        return float(np.sum(np.linalg.norm(np.diff(path, axis=0), axis=-1)))
-
     width = 1.0 / len(weighted)
     for _ in range(4):
         tried = guess + width * np.linspace(-1.0, 1.0, 33)
-        guess = tried[int(np.argmin([length(rotation) for rotation in tried]))]
+        orders = np.argsort(np.mod(tried[:, None] * np.arange(len(weighted)), 1.0), axis=1, kind="stable")
+        lengths = np.sum(np.linalg.norm(np.diff(weighted[orders], axis=1), axis=-1), axis=1)
+        guess = tried[int(np.argmin(lengths))]
         width /= 10.0
     return float(guess)
 
