@@ -150,24 +150,23 @@ def _manifold(axis: np.ndarray, verdict: np.ndarray, verdicts) -> np.ndarray:
     rounds, inside = 2, 15
     low, high = np.full((2, len(axis)), np.nan)
     for row, values in enumerate(verdict):
-        flips = np.flatnonzero(_changes(values))
-        if len(flips):
-            place = flips[np.argmin(np.abs(axis[flips] + axis[flips + 1]))]
-            low[row], high[row] = axis[place], axis[place + 1]
+        if len(brackets := _changes(axis, values)):
+            low[row], high[row] = brackets[np.argmin(np.abs(np.sum(brackets, axis=1)))]
     known = np.flatnonzero(np.isfinite(low))
     for _ in range(rounds if len(known) else 0):
         inner = np.linspace(low[known], high[known], inside + 2, axis=1)
         found = verdicts(np.broadcast_to(axis[known, None], inner.shape), inner)
-        changes = _changes(found)
-        place, rows = np.argmax(changes, axis=1), np.arange(len(known))
-        at = changes[rows, place]
-        low[known] = np.where(at, inner[rows, place], low[known])
-        high[known] = np.where(at, inner[rows, place + 1], high[known])
+        for row, places, values in zip(known, inner, found, strict=True):
+            if len(brackets := _changes(places, values)):
+                low[row], high[row] = brackets[0]
     return 0.5 * (low + high)
 
 
-def _changes(verdict: np.ndarray) -> np.ndarray:
-    """Between which neighbours on the last axis the verdict changes from sliding to a limit cycle, or back."""
-    pair = {int(Verdict.SLIDING), int(Verdict.LIMIT_CYCLE)}
-    decided = np.isin(verdict, list(pair))
-    return (verdict[..., 1:] != verdict[..., :-1]) & decided[..., 1:] & decided[..., :-1]
+def _changes(places: np.ndarray, verdict: np.ndarray) -> np.ndarray:
+    """The pairs of places (rows) between which the verdict changes from sliding to a limit cycle, or back. One place between
+    them may be undecided: the saddle itself is.
+    """
+    decided = np.flatnonzero(np.isin(verdict, [Verdict.SLIDING, Verdict.LIMIT_CYCLE]))
+    before, after = decided[:-1], decided[1:]
+    changed = (verdict[before] != verdict[after]) & (after - before <= 2)
+    return np.stack([places[before], places[after]], axis=1)[changed]

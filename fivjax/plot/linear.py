@@ -50,12 +50,16 @@ def eigenvalues(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
         mu_crit = float(dataset["mu_crit"])
         for axes in (upper, lower):
             axes.axvline(mu_crit, color="0.4", linestyle=(0, (1, 2)), linewidth=1.2)
+        # At the top, where no curve comes near the limit, and on the side with more room.
+        on_the_left = mu_crit > np.mean(lower.get_xlim())
         lower.annotate(
             f"$\\mu_{{crit}}$ = {mu_crit:.5g}, {float(dataset['frequency_crit']):.3f} Hz",
-            (mu_crit, 0),
-            xytext=(-6, 6),
+            (mu_crit, 1),
+            xycoords=lower.get_xaxis_transform(),
+            xytext=(-6 if on_the_left else 6, -6),
             textcoords="offset points",
-            ha="right",
+            ha="right" if on_the_left else "left",
+            va="top",
             fontsize="small",
         )
     upper.set_ylabel(variable_label(dataset["frequency"]))
