@@ -65,8 +65,7 @@ def test_show_draws_what_has_a_picture(run, tmp_path):
 
 def test_the_remedy_for_three_axes_works(a_map):
     """The remedy once named an axis that the map did not have."""
-    with refused(ValueError, "needs two axes, but this map has 1: p"):
-        fj.show(a_map.isel(mu=0, k1=0))
+    assert isinstance(fj.show(a_map.isel(mu=0, k1=0)), Figure)
     with refused(ValueError, "2 axes, but it has 3: mu, p, k1", "`fj.show(m.isel(k1=0))`"):
         fj.show(a_map)
     assert isinstance(eval("fj.show(m.isel(k1=0))", {"fj": fj, "m": a_map}), Figure)

@@ -267,18 +267,29 @@ def test_names_of_methods_do_not_collide():
     figure.draw_without_rendering()
 
 
+def test_a_map_over_one_axis_is_a_curve_of_what_is_reached():
+    m = a_map(mu=[0.1, 0.15, 0.2])
+    m["verdict"].values[:] = fj.Verdict.SLIDING, fj.Verdict.UNDECIDED, fj.Verdict.LIMIT_CYCLE
+    m["amplitude"].values[:] = np.nan, np.nan, 2.5
+    figure = plot.bistability(m)
+    points = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in figure.axes[0].lines}
+    assert points["limit cycle"] == ([0.2], [2.5]) and points["returns to sliding"] == ([0.1], [0.0])
+    assert points["no verdict (1 of 3)"] == ([0.15], [0.0])
+    figure.draw_without_rendering()
+
+
 # --- refusals
 
 
 def test_a_slice_of_a_map_is_selected_by_the_call_that_the_sentence_gives():
     """Three axes: the call in the sentence is carried out, and draws."""
     m = a_map(mu=[0.1, 0.2], p=[1.5, 2.5], belt_speed=[1.5, 2.5])
-    with pytest.raises(ValueError, match="needs two axes, but this map has 3: mu, p, belt_speed") as refused:
+    with pytest.raises(ValueError, match="two axes at most, but this map has 3: mu, p, belt_speed") as refused:
         plot.bistability(m)
     (call,) = re.findall(r"`(fj\.plot\.bistability\(.*?\))`;", str(refused.value))
     assert isinstance(eval(call, {"fj": fj, "m": m}), Figure)
-    with pytest.raises(ValueError, match="this map has 1: p"):
-        plot.bistability(a_map(p=[1.5, 2.5]))
+    with pytest.raises(ValueError, match="this map has none"):
+        plot.bistability(m.isel(mu=0, p=0, belt_speed=0))
     found = a_threshold().expand_dims(belt_speed=[1.0, 2.0]).transpose("mu", "belt_speed")
     with pytest.raises(ValueError, match="over 2: mu, belt_speed") as refused:
         plot.critical(found)
