@@ -72,7 +72,7 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
         kinds.append(kind)
         amplitudes.append(np.nan if found is None else float(found.amplitude))
         turns = None if found is None else found.rotation_number
-        rotation.append(np.nan if turns is None else abs(float(turns)))
+        rotation.append(np.nan if turns is None else float(turns))
     dataset = xr.Dataset(
         {
             "place": ("point", places),

@@ -73,7 +73,7 @@ class LimitCycle(eqx.Module):
     harmonics: Complex[np.ndarray, "count n"]  # Fourier coefficients of the velocities, m/s
     points: Float[np.ndarray, "k state"]  # on the section, of one period or the torus, as deviations from sliding
     return_jacobian: Float[np.ndarray, "state state"]  # of the section's return map over one period
-    rotation_number: float | None = None  # of a torus, in turns per return
+    rotation_number: float | None = None  # of a torus, in turns per return, without sign
     # Of the neighbourhood that was seen to be drawn in: how far it reaches, relative to the cycle's size; and the factor by
     # which distances in it fall in one period (to which share of it everything comes back, of a torus). None if not asked for.
     reach: float | None = None

@@ -99,13 +99,16 @@ def off_the_curve(path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]
 
 
 def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
-    """Turns per return: first from the angle about the mean, then so that the points in their order have the shortest path."""
+    """Turns per return: first from the angle about the mean, then so that the points in their order have the shortest path.
+
+    Without sign: a closed curve may be run through either way.
+    """
     centred = weighted - np.mean(weighted, axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     plane = centred @ axes[:2].T
     angle = np.arctan2(plane[:, 1], plane[:, 0])
     turns = np.diff(np.unwrap(angle)) / (2 * np.pi)
-    guess = smooth_mean(turns)
+    guess = abs(smooth_mean(turns))
     width = 1.0 / len(weighted)
     for _ in range(4):
         tried = guess + width * np.linspace(-1.0, 1.0, 33)
