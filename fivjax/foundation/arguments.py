@@ -136,7 +136,7 @@ def one_of(name: str, value, choices: Iterable[str]) -> None:
     """Refuse a word that is not among the choices."""
     choices = list(choices)
     # An array compares as one.
-    is_array = hasattr(value, "shape")
+    is_array = hasattr(value, "shape") and not isinstance(value, str)
     if is_array or value not in choices:
         listed = ", ".join(f'"{choice}"' for choice in choices)
         said = describe(value) if is_array else repr(value)

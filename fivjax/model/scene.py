@@ -103,7 +103,7 @@ class Scene(eqx.Module):
         self.belt_speed = real(belt_speed)
         self.load = own_load
         self.restitution = real(restitution)
-        self.impact_law = impact_law
+        self.impact_law = str(impact_law)  # NumPy's text, too
         whose: dict[str, str] = {}
         for part, parameters in self._parameters_of_parts().items():
             for name in parameters:

@@ -253,6 +253,8 @@ def test_impact_laws_are_kept_by_replace(law):
     scene = paper_scene_with(impact_law=law)
     assert scene.impact_law == law
     assert scene.replace(mu=0.1).impact_law == law
+    # As an array of words gives it.
+    assert repr(paper_scene_with(impact_law=np.array([law])[0]).impact_law) == repr(law)
 
 
 def test_replace_reaches_every_part_and_nothing_else():
