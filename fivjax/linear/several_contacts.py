@@ -14,12 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..foundation.linear_solve import solve
 from ..foundation.matrix_routines import eigenvalues
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
-from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices, sliding_rows
+from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices
 from ..model.structure import Structure
 from .gradients import in_natural_units, significant_growth
 from .linearisation import linear_sliding, state_matrix, time_scale_of
@@ -38,25 +37,13 @@ def free_closed_coordinates(structure: Structure) -> np.ndarray:
 
 def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"]]:
     """The state matrix of a scene's steady sliding, and its normal forces in N; not finite where there is none."""
+    forces = jnp.atleast_1d(steady_sliding(scene, scene.load.final)[1])
     if one_contact(scene.structure):
-        _, normal_force = steady_sliding(scene, scene.load.final)
-        return linear_sliding(scene).matrix, normal_force[None]
-    count = len(scene.structure.contacts)
-    speed = jnp.broadcast_to(jnp.abs(scene.belt_speed), (count,))
-    friction = jnp.broadcast_to(jnp.sign(scene.belt_speed) * scene.friction(speed), (count,))
-    forces = sliding_forces(scene.structure, friction, scene.load.final)
+        return linear_sliding(scene).matrix, forces
+    speed = jnp.broadcast_to(jnp.abs(scene.belt_speed), forces.shape)
+    friction = jnp.broadcast_to(jnp.sign(scene.belt_speed) * scene.friction(speed), forces.shape)
     slopes = jnp.zeros_like(friction) if scene.friction.constant else forces * slope_of(scene.friction, speed)
     return sliding_state_matrix(scene.structure, friction, slopes), forces
-
-
-def sliding_forces(structure: Structure, friction: Float[Array, " c"], force) -> Float[Array, " c"]:
-    """The normal forces of steady sliding under a load, in N."""
-    structure = in_contact_coordinates(structure)
-    normal, free = np.atleast_1d(contact_coordinates(structure)[1]), free_closed_coordinates(structure)
-    *_, stiffness, load = structure.matrices
-    rows = sliding_rows(structure, jnp.concatenate([stiffness, load[:, None]], axis=1), friction)
-    displacements = solve(rows[:, free], rows[:, -1] * force)
-    return stiffness[normal][:, free] @ displacements - load[normal] * force
 
 
 def sliding_state_matrix(
