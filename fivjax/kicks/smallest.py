@@ -146,7 +146,8 @@ def smallest_kick(
     **Returns:** a `SmallestKick`, or a `SmallestPerturbation` for a state or a history; printing it shows the gap.
 
     **Raises:** `TypeError` for a load without a pulse; `ValueError` for friction that varies with slip speed, sliding that is
-    not stable, and invalid names or bounds; `NoSquealingKick` if nothing that was tried leads to a limit cycle.
+    not stable, and invalid names or bounds; `NoSquealingKick`, which has the bound, if nothing that was tried leads to a limit
+    cycle.
 
     **Example:**
 
@@ -192,7 +193,8 @@ def smallest_kick(
     if not np.any(np.isfinite(scanned["p_crit"])):
         raise NoSquealingKick(
             f"No kick with p up to {given['p'][1]:g} that was tried leads to a limit cycle. Raise `bounds`, or scan more "
-            f"finely."
+            f"finely.",
+            certified,
         )
     best = int(np.nanargmin(scanned["p_crit"]))
     row = scanned.isel(duration=best)

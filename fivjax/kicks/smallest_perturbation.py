@@ -113,14 +113,23 @@ def dataset_of(values: dict, scene: Scene | None, **settings) -> "xr.Dataset":
 class NoSquealingKick(ValueError):
     """No kick, state or history that was tried within the bounds leads to a limit cycle.
 
+    `certified` is the bound below which none does: the p of a kick, or the size of a `SmallestPerturbation`.
+
     **Example:**
 
         >>> try:
         ...     fj.smallest_kick(scene, over="p", bounds={"p": (1.0, 1.02)})  # doctest: +SLOW
-        ... except fj.NoSquealingKick:
-        ...     print("none up to 1.02")
-        none up to 1.02
+        ... except fj.NoSquealingKick as none:
+        ...     print("proved up to there:", none.certified > 1.02)
+        proved up to there: True
     """
+
+    def __init__(self, sentence: str, certified: float):
+        super().__init__(sentence, certified)
+        self.certified = certified
+
+    def __str__(self) -> str:
+        return f"{self.args[0]} Below {self.certified:.6g}, the certified bound, none does."
 
 
 def smallest_state(scene: Scene) -> SmallestPerturbation:
@@ -177,7 +186,8 @@ def _smallest(scene: Scene, over: str, kind: Perturbation, most: float) -> Small
     if not np.any(np.isfinite(found.low)):
         raise NoSquealingKick(
             f"None of the {len(shapes)} shapes that were tried leads to a limit cycle at up to "
-            f"{largest / certificate.size:.3g} times the certified bound. Look with `fivjax.basins`, or kick harder."
+            f"{largest / certificate.size:.3g} times the certified bound. Look with `fivjax.basins`, or kick harder.",
+            certificate.size,
         )
     best = int(np.nanargmin(np.where(np.isfinite(found.low), found.high, np.nan)))
     shape, low, high = shapes[best], float(found.low[best]), float(found.high[best])
