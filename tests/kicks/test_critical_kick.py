@@ -138,7 +138,7 @@ def test_a_narrow_range_is_scanned_in_steps_that_fit_in():
     found = fj.critical_perturbation(SCENE, p_range=(1.105, 1.11), tolerance=1e-3, progress=False)
     assert float(found.p_crit_low[0]) < 1.1072058 < float(found.p_crit_high[0])
     assert json.loads(found.attrs["settings"])["p_step"] == pytest.approx(0.005)
-    with pytest.raises(fj.NoSquealingKick, match="Below .*, the certified bound, none does") as none:
+    with pytest.raises(fj.NoSquealingKick, match="the certified bound, none does") as none:
         fj.smallest_kick(SCENE, over="p", bounds={"p": (1.0, 1.005)}, progress=False)
     # What was proved is not lost; it is the bound of the search that finds one.
     assert none.value.certified == fj.smallest_kick(SCENE, over="p", bounds={"p": (1.0, 1.2)}, progress=False).certified
