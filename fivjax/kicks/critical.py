@@ -137,9 +137,9 @@ def critical_perturbation(
     if derivatives:
         stage("Newton's method and derivatives")
 
-        def narrowed(rows: Int[np.ndarray, " s"], found: FirstCrossing) -> FirstCrossing:
+        def narrowed(rows: Int[np.ndarray, " s"], found: FirstCrossing, at_most: float) -> FirstCrossing:
             ends = np.tile(AT_ENDS, (len(rows), 1))
-            finer, again = kicked.only(rows).narrowed(found.brackets[rows], ends, tolerance)
+            finer, again = kicked.only(rows).narrowed(found.brackets[rows], ends, min(tolerance, at_most))
             contradicted[rows] |= again
             return finer
 

@@ -11,11 +11,11 @@ from .narrowing import AT_ENDS, Kicked
 from .stable_manifold import Critical, critical_kick
 from .touching import GrazingKick, grazing_kick
 
-Narrowed = Callable[[Int[np.ndarray, " r"], FirstCrossing], FirstCrossing]
+Narrowed = Callable[[Int[np.ndarray, " r"], FirstCrossing, float], FirstCrossing]
 
 KINDS = ("none", "manifold", "grazing")
-# Relative distance of the two proving trajectories from a critical kick.
-BESIDE = 1e-9
+# Relative distance of the two proving trajectories from a critical kick; and the width of the narrowest brackets.
+BESIDE, CLOSEST = 1e-9, 1e-10
 
 NO_CHANGE = "no change from sliding to a limit cycle lies in the range"
 NO_SADDLE = (
@@ -35,8 +35,8 @@ def with_derivatives(
 ) -> tuple[FirstCrossing, dict[str, np.ndarray]]:
     """The crossings, by Newton's method where it finds them; and kind, derivatives and reasons for each row.
 
-    `narrowed(rows, found)` gives the crossings of those rows in narrower brackets, for where Newton's method does not find them
-    from these.
+    `narrowed(rows, found, width)` gives the crossings of those rows in narrower brackets, for where Newton's method does not
+    find them from these.
     """
     names, rows = differentiable(kicked.scene), len(found.middle)
     kind, why = np.full(rows, KINDS[0], dtype="<U8"), np.full(rows, NO_CHANGE, dtype=object)
@@ -44,14 +44,25 @@ def with_derivatives(
     middle, low, high = found.middle.copy(), found.low.copy(), found.high.copy()
     left = np.flatnonzero(np.isfinite(found.low) & np.isfinite(found.high))
     why[left] = NO_SADDLE
-    # A motion that passes no saddle, or one that is not on the boundary, may just touch another contact mode.
-    attempts = [(KINDS[1], critical_kick), (KINDS[1], critical_kick), (KINDS[2], grazing_kick)]
-    for attempt, (name, method) in enumerate(attempts):
-        if attempt == 1 and len(left):
-            finer = narrowed(left, found)
-            middle[left], low[left], high[left] = finer.middle, finer.low, finer.high
+    # By each method, in brackets of this width; without one, in those of the attempt before. A motion that passes no saddle, or
+    # one that is not on the boundary, may just touch another contact mode. On the way to a saddle a motion may have other
+    # modes than the saddle has, for a hundred crossings that part neighbours; only the closest ones come on together.
+    attempts = (
+        (KINDS[1], critical_kick, None),
+        (KINDS[1], critical_kick, np.inf),
+        (KINDS[2], grazing_kick, None),
+        (KINDS[1], critical_kick, CLOSEST),
+    )
+    for attempt, (name, method, width) in enumerate(attempts):
+        if width is not None and len(left):
+            finer = narrowed(left, found._replace(middle=middle, low=low, high=high), width)
+            # What undecided kicks keep from the narrowest bracket is known no worse than before.
+            kept = np.isfinite(finer.middle) | (width != CLOSEST)
+            for whole, part in ((middle, finer.middle), (low, finer.low), (high, finer.high)):
+                whole[left[kept]] = part[kept]
             left = left[np.isfinite(finer.low) & np.isfinite(finer.high)]
-            why[left] = NO_SADDLE
+            if width != CLOSEST:
+                why[left] = NO_SADDLE
         critical: dict[int, Critical | GrazingKick] = {}
         for row in left:
             here = kicked.scene.replace(**{key: float(column[row]) for key, column in kicked.columns.items()})

@@ -142,3 +142,21 @@ def test_a_narrow_range_is_scanned_in_steps_that_fit_in():
         fj.smallest_kick(SCENE, over="p", bounds={"p": (1.0, 1.005)}, progress=False)
     # What was proved is not lost; it is the bound of the search that finds one.
     assert none.value.certified == fj.smallest_kick(SCENE, over="p", bounds={"p": (1.0, 1.2)}, progress=False).certified
+
+
+@pytest.mark.slow
+def test_a_saddle_is_found_that_motions_come_to_in_other_modes():
+    """Static friction is 3.6 times kinetic. The critical motion does not stick for 90 returns, then does as the saddle does, and
+    kicks apart by 1e-6 part before. The reference is by bisection with a solver of its own.
+    """
+    mu, law = 0.1461210197926363, fj.Coulomb(0.1461210197926363, 3.5664993323201046 * 0.1461210197926363)
+    load = fj.Pulse(force=100.0, p=1.5, duration=0.062305784881210094)
+    scene = fj.Scene(fj.belt_oscillator(), law, belt_speed=2.4027836606445323, load=load)
+    step = 1e-6
+    found = fj.critical_perturbation(
+        scene, mu=[mu - step, mu, mu + step], p_range=(1.5, 1.7), derivatives=True, progress=False
+    )
+    assert set(found["kind"].values) == {"manifold"} and not np.any(found["why_none"].values)
+    low, p, high = found["p_crit"].values
+    assert p == pytest.approx(1.57153522489, abs=1e-11)
+    assert found["d_p_crit"].sel(parameter="mu").values[1] == pytest.approx((high - low) / (2 * step), rel=1e-6)
