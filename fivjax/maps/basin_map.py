@@ -95,12 +95,15 @@ def basins(
     method = EventExact() if method is None else method
     check_run(scene, method, t_max, memory)
     arguments.truth("kick", kick)
+    kicked = scene
+    if not kick:
+        scene = under_final_load(scene)
+    if of_kick := [name for name in axes if name in kicked.parameters and name not in scene.parameters]:
+        raise ValueError(f"Axis `{of_kick[0]}` is of the kick, which is left out here. Give `kick=True`.")
     states = _states_among(scene, axes)
     if not states:
         names = ", ".join(f"{name}, d{name}" for name in scene.structure.coordinates)
         raise ValueError(f"A map of basins needs at least one displacement or velocity as its axis: {names}.")
-    if not kick:
-        scene = under_final_load(scene)
     check_size(axes)
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}

@@ -255,6 +255,8 @@ def simulate(
             found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
     if "grown" in found:
         ending = _ending(scene, stepper, found, found.pop("grown"), most, given is None)
+    if not is_known(found["velocity"]):
+        found = _without_derivatives_unless_begun(found)
     settings = (
         ("method", describe_method(method)),
         ("dt", float(method.dt)),
@@ -263,6 +265,14 @@ def simulate(
         ("start", start),
     )
     return Trajectory(**found, scene=scene, outcome=ending.astype(np.int8), settings=settings)
+
+
+def _without_derivatives_unless_begun(rows: dict) -> dict:
+    """The rows; where already the first is no number, their derivatives are none either. They would be zero, which an optimiser
+    takes for a minimum.
+    """
+    share = jnp.where(jnp.all(jnp.isfinite(rows["velocity"][0])), 1.0, jnp.nan)
+    return jax.tree.map(lambda leaf: leaf * share if eqx.is_inexact_array(leaf) else leaf, rows)
 
 
 def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:

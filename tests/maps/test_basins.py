@@ -59,6 +59,8 @@ def test_starts_that_make_no_sense_are_refused_before_anything_compiles():
     scene = paper()
     with pytest.raises(ValueError, match="Unknown axis `x3`; the states are x2, y1, y2, dx2, dy1, dy2"):
         fj.basins(scene, x3=[0.0, 1.0])
+    with pytest.raises(ValueError, match="Axis `p` is of the kick, which is left out here"):
+        fj.basins(scene, x2=[0.0, 1e-3], p=[1.2, 1.3])
     with pytest.raises(ValueError, match="at least one displacement or velocity"):
         fj.basins(scene, mu=[0.1, 0.2])
     with pytest.raises(ValueError, match="Axis `y2` must not go below the belt, but holds -1 m"):

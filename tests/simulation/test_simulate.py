@@ -214,6 +214,18 @@ def test_a_belt_that_would_have_to_pull_is_told_inside_a_transformation(paper_sc
     assert np.all(np.isfinite(rows[0])) and np.all(np.isnan(rows[1]))
 
 
+@pytest.mark.parametrize("derivatives", ["both", "reverse"])
+def test_a_run_that_cannot_begin_has_no_derivative_either(paper_scene, derivatives):
+    """It was zero, as at a minimum."""
+
+    def speed(force):
+        return fj.simulate(paper_scene.replace(force=force), 5e-3, 1e-3, derivatives=derivatives).velocity[-1, 0]
+
+    with jax.enable_x64(True):
+        slopes = jax.vmap(jax.grad(speed))(np.array([100.0, -100.0]))
+    assert np.isfinite(slopes[0]) and np.isnan(slopes[1])
+
+
 def test_growth_without_bound_is_a_failure_with_a_name(paper_scene):
     """Rejects a run of Tsit5 with steps far too long that ends at 1e123 m/s and is said to have reached its end."""
     run = fj.simulate(paper_scene, 0.5, 1e-2, fj.WhereSwitched(diffrax.Tsit5(), dt=5e-3))
