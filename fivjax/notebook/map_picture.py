@@ -19,6 +19,11 @@ class MapPicture:
         self.scene = Scene.from_dataset(dataset) if "scene" in dataset.attrs else scene
         self.values = {str(name): dataset[name].values for name in dataset["verdict"].dims}
         figure = plot.bistability(dataset)
+        if len(self.values) != 2:
+            raise ValueError(
+                f"Argument `dataset` must be a map over two axes, but has only {', '.join(self.values)}. Give "
+                f"`fj.bistability_map` another one, such as `p=np.linspace(1, 4, 64)`."
+            )
         self._canvas = FigureCanvasAgg(figure)
         self._canvas.draw()
         self.axes = figure.axes[0]
