@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+import signal
 import tempfile
 from importlib import metadata
 
@@ -12,6 +13,10 @@ import fivjax as fj
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
 FLAGS, KERNEL_FLAGS = "XLA_FLAGS", "FIVJAX_KERNEL_FLAGS"
+
+# A shell that starts them in the background has them ignore Ctrl-C, and what they start; some of them send it.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Tests run most programs once or twice, so they wait for the compiler and not for what it has compiled. Without LLVM's
 # optimisations, and without parts that are compiled side by side, it takes less than half of the time. At this level LLVM would
