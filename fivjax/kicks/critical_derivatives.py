@@ -56,11 +56,11 @@ def with_derivatives(
     for attempt, (name, method, width) in enumerate(attempts):
         if width is not None and len(left):
             finer = narrowed(left, found._replace(middle=middle, low=low, high=high), width)
-            # What undecided kicks keep from the narrowest bracket is known no worse than before.
-            kept = np.isfinite(finer.middle) | (width != CLOSEST)
+            # Where undecided kicks keep a bracket from becoming the narrowest, the one before stands, and has been tried.
+            narrow = np.isfinite(finer.middle) | (width != CLOSEST)
             for whole, part in ((middle, finer.middle), (low, finer.low), (high, finer.high)):
-                whole[left[kept]] = part[kept]
-            left = left[np.isfinite(finer.low) & np.isfinite(finer.high)]
+                whole[left[narrow]] = part[narrow]
+            left = left[narrow & np.isfinite(finer.low) & np.isfinite(finer.high)]
             if width != CLOSEST:
                 why[left] = NO_SADDLE
         critical: dict[int, Critical | GrazingKick] = {}

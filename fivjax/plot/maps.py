@@ -6,9 +6,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from ..foundation.quantities import QUANTITIES
 from ..verdicts.verdict import Verdict
-from .style import BLACK, BLUE, VERMILION, axis_label, cell_edges, check_dataset, fill_cells, new_figure, with_unit
+from .style import BLACK, BLUE, VERMILION, axis_label, cell_edges, check_dataset, fill_cells, new_figure
 from .thresholds import draw_threshold
 
 SLIDING_SHADE = "#f2f2f2"
@@ -40,8 +39,7 @@ def bistability(
     cycle = np.ma.masked_where(verdict != Verdict.LIMIT_CYCLE, dataset[value].values.T)
     mesh = axes.pcolormesh(x, y, cycle, cmap="viridis", rasterized=True)
     if cycle.count():
-        long_name, unit = QUANTITIES.get(value, (value, "1"))
-        figure.colorbar(mesh, ax=axes, label=with_unit(long_name, unit))
+        figure.colorbar(mesh, ax=axes, label=axis_label(value))
     open_ = verdict < 0
     handles = [Patch(facecolor=SLIDING_SHADE, edgecolor="0.6", label="returns to sliding")]
     handles += fill_cells(axes, (x, y), open_, VERMILION, f"no verdict ({int(open_.sum())} of {open_.size})")
@@ -77,7 +75,7 @@ def _over_one_axis(figure: Figure, dataset: xr.Dataset, value: str) -> Figure:
     if name == "mu" and limit is not None:
         axes.axvline(limit, color=VERMILION, ls="--", lw=1.4, label=_limit_label(limit))
         _fit(axes.set_xlim, cell_edges(x), limit)
-    axes.set(xlabel=axis_label(name), ylabel=with_unit(*QUANTITIES.get(value, (value, "1"))))
+    axes.set(xlabel=axis_label(name), ylabel=axis_label(value))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     return figure
 
