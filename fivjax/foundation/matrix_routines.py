@@ -20,15 +20,18 @@ def register() -> None:
 
 
 def eigenvalues(matrix: Num[Array, "n n"]) -> Complex[Array, " n"]:
-    """The eigenvalues of a general matrix, in any order. Differentiable where they are simple."""
+    """The eigenvalues of a general matrix, in any order. Differentiable, more than once, where they are simple."""
     return _eigenvalues(matrix)
 
 
 def eigenvectors(
     matrix: Num[Array, "n n"],
 ) -> tuple[Complex[Array, " n"], Complex[Array, "n n"], Complex[Array, "n n"]]:
-    """The eigenvalues of a general matrix, and its left and right eigenvectors as columns; not differentiable."""
-    return _one_at_a_time(lambda one: tuple(jax.lax.linalg.eig(one, compute_left_eigenvectors=True)))(matrix)
+    """The eigenvalues of a general matrix, and its left and right eigenvectors as columns.
+
+    Differentiable where the eigenvalues are simple. Derivatives have no part along an eigenvector itself, whose length is free.
+    """
+    return _eigenvectors(matrix)
 
 
 def log_determinant(matrix: Float[Array, "n n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -54,6 +57,23 @@ def _(primals, tangents):
     # That of left* A right with constant eigenvectors.
     along = jnp.sum(left * (change.astype(left.dtype) @ right), axis=0) / jnp.sum(left * right, axis=0)
     return values, along
+
+
+@jax.custom_jvp
+def _eigenvectors(matrix):
+    return _one_at_a_time(lambda one: tuple(jax.lax.linalg.eig(one, compute_left_eigenvectors=True)))(matrix)
+
+
+@_eigenvectors.defjvp
+def _(primals, tangents):
+    (matrix,), (change,) = primals, tangents
+    values, left, right = _eigenvectors(matrix)
+    projected = left.conj().T @ change.astype(left.dtype) @ right
+    lengths = jnp.sum(left.conj() * right, axis=0)
+    gaps = jnp.where(jnp.eye(len(values), dtype=bool), jnp.inf, values[None, :] - values[:, None])
+    along = projected / lengths[:, None] / gaps  # the parts of each right eigenvector's change along the others
+    against = projected / lengths[None, :] / gaps
+    return (values, left, right), (jnp.diagonal(projected) / lengths, -left @ against.conj().T, right @ along)
 
 
 @jax.custom_jvp

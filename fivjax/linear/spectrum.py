@@ -113,8 +113,9 @@ _growth_rate = compiled(
 def growth_rate(system: Structure | Scene, mu=None, *, direction: int = 1) -> Float[Array, ""]:
     """The largest real part of the eigenvalues of steady sliding, in 1/s: positive where it is unstable.
 
-    Arguments as in `linearisation`. Differentiable in every parameter, with or without double precision turned on. The
-    derivative is that of eigenvalues, which grows without bound towards a coalescence; `margin` is smooth there.
+    Arguments as in `linearisation`. Differentiable in every parameter, with or without double precision turned on, and twice
+    (`jax.hessian`). Derivatives are those of eigenvalues, which grow without bound towards a coalescence; `margin` is smooth
+    there.
 
     **Example:**
 

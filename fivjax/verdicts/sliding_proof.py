@@ -130,17 +130,6 @@ def _clusters(eigenvalues: np.ndarray) -> np.ndarray:
     return (number[:, None, :] == np.arange(number.max() + 1)[:, None]).astype(float)
 
 
-def slides_forever(
-    mechanics: Mechanics,
-    modes: SlidingModes,
-    contact: Contact,
-    deviation: State,
-    under_final_load: Bool[Array, ""] | bool,
-) -> Bool[Array, ""]:
-    """Whether a bound shows that a contact which slides now never stops sliding, see `margin_share_bound`."""
-    return margin_share_bound(mechanics, modes, contact, deviation, under_final_load) < 1
-
-
 def margin_share_bound(
     mechanics: Mechanics,
     modes: SlidingModes,

@@ -7,7 +7,7 @@ import numpy as np
 
 from fivjax.contact import Contact, Mechanics, Status
 from fivjax.linear.linearisation import linear_sliding
-from fivjax.verdicts.sliding_proof import slides_forever, sliding_modes
+from fivjax.verdicts.sliding_proof import margin_share_bound, sliding_modes
 
 
 def proved(scenes, deviations):
@@ -20,6 +20,8 @@ def proved(scenes, deviations):
         contact = Contact((Status.SLIDE * one).astype(jnp.int32), one)
 
         def of_group(mechanics, modes):
-            return jax.vmap(lambda y: slides_forever(mechanics, modes, contact, y, True))(jnp.asarray(deviations))
+            return jax.vmap(lambda y: margin_share_bound(mechanics, modes, contact, y, True) < 1)(
+                jnp.asarray(deviations)
+            )
 
         return np.asarray(eqx.filter_jit(jax.vmap(of_group))(mechanics, jax.tree.map(jnp.asarray, modes)))

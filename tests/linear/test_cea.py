@@ -189,6 +189,18 @@ def test_growth_rate_gradient_is_that_of_the_eigenvalues():
     assert abs(slope - reference.difference(reference.growth, 0.3, 1e-3)) < 1e-6 * slope
 
 
+@pytest.mark.parametrize("hessian", [jax.hessian, lambda f: jax.jacfwd(jax.jacfwd(f))], ids=["reverse", "forward"])
+def test_the_growth_rate_has_second_derivatives(hessian):
+    with jax.enable_x64(True):
+        curvature = float(hessian(lambda mu: cea.growth_rate(belt(), mu))(0.3))
+
+    def difference(step):
+        above, here, below = (reference.growth(0.3 + k * step) for k in (1, 0, -1))
+        return (above - 2 * here + below) / step**2
+
+    assert abs(curvature - (4 * difference(5e-4) - difference(1e-3)) / 3) < 1e-6 * abs(curvature)
+
+
 # --- coalescence and slope
 
 

@@ -11,7 +11,7 @@ import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, slides_uniquely
 from fivjax.linear.linearisation import linear_sliding
 from fivjax.section.free_directions import directions_of_several
-from fivjax.verdicts.sliding_proof import slides_forever, sliding_modes
+from fivjax.verdicts.sliding_proof import margin_share_bound, sliding_modes
 from tests.helpers.several_contacts import copies, scene_of
 
 SHARES = np.array([1.0, 0.8])
@@ -33,7 +33,7 @@ def proofs(scene, deviations):
         mechanics = eqx.filter_jit(Mechanics)(scene)
         one = jnp.ones(jnp.shape(mechanics.belt_speed))
         contact = Contact((Status.SLIDE * one).astype(jnp.int32), one)
-        prove = jax.jit(jax.vmap(lambda y: slides_forever(mechanics, modes, contact, y, True)))
+        prove = jax.jit(jax.vmap(lambda y: margin_share_bound(mechanics, modes, contact, y, True) < 1))
         return np.asarray(prove(jnp.asarray(deviations)))
 
 
