@@ -159,10 +159,13 @@ class _Rays:
         return verdicts_from(self.scene, self.kind.states(u) + self.rest, "states", self.attractors)
 
     def first(self, shapes: Vectors, sizes: np.ndarray, width: float) -> FirstCrossing:
-        """The first crossing along each ray among `sizes` (rays, sizes), narrowed down to the relative width `width`."""
+        """The first crossing along each ray among `sizes` (rays, sizes). The smallest of all, and each that may be smaller, is
+        narrowed down to the relative width `width`.
+        """
         found = first_crossings(sizes, self._along(shapes, sizes))
         while True:
-            wide = np.flatnonzero(found.high - found.low > width * found.high)
+            smallest = np.min(found.high, where=np.isfinite(found.low), initial=np.inf)
+            wide = np.flatnonzero((found.high - found.low > width * found.high) & (found.low < smallest))
             if not len(wide):
                 return found
             inner = np.linspace(found.low[wide], found.high[wide], INSIDE + 2, axis=1)
