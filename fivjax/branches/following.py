@@ -32,97 +32,158 @@ def follow_branch(
     family: Family, start: BranchPoint, sense: float, bounds: tuple[float, float], most: int
 ) -> HalfBranch:
     """The branch in one direction from a cycle, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
-    # After a step that converged quickly, the next is longer: by the first factor below the length `FIRST`, by the second
-    # above.
-    soon, later = 3.0, 1.5
-    # Gaps that a branch goes over: beyond one it may come back on itself, again and again.
-    most_gaps = 16
-    # A branch of pure sliding ends at the equilibrium once its cycle has shrunk to this share of its first size.
-    small = 0.02
-    here, tangent = start, start.curve.tangent(start.cycle, None)
-    tangent = tangent * (sense if tangent[-1] >= 0 else -sense)
-    points: list[BranchPoint] = []
-    step, gaps = FIRST, 0
+    front = _Front(family, start, sense, bounds)
+    while len(front.points) < most:
+        stage(f"following, {len(front.points)} cycles so far")
+        if (ended := front.advance()) is not None:
+            return ended
+    return front.ended(front.here, f"`points` = {most} points are computed")
 
-    def over_a_gap():
-        nonlocal gaps
-        gaps += 1
-        return _over_a_gap(family, points, start, sense, bounds) if gaps <= most_gaps else None
 
-    while len(points) < most:
-        stage(f"following, {len(points)} cycles so far")
-        curve = here.curve
-        ahead = _ahead(curve, here.cycle, tangent, step)
+class _Front:
+    """The front of a branch that is followed in one direction: its latest point, with the tangent and the step with which to go
+    on, and the points behind it. Methods that go on return the whole branch where it ends, and None where it does not.
+    """
+
+    def __init__(self, family: Family, start: BranchPoint, sense: float, bounds: tuple[float, float]):
+        self.family, self.start, self.sense, self.bounds = family, start, sense, bounds
+        tangent = start.curve.tangent(start.cycle, None)
+        self.here, self.tangent, self.step = start, tangent * (sense if tangent[-1] >= 0 else -sense), FIRST
+        self.points: list[BranchPoint] = []
+        self.gaps = 0
+
+    def ended(self, at: BranchPoint, why: str) -> HalfBranch:
+        return HalfBranch(self.points, f"At {self.family.name} = {at.cycle.parameter:.12g} {why}.")
+
+    def _within(self, cycle: ComputedCycle) -> bool:
+        return self.bounds[0] <= cycle.parameter <= self.bounds[1]
+
+    def advance(self) -> HalfBranch | None:
+        """One step further, or around what is in its way."""
+        ahead = _ahead(self.here.curve, self.here.cycle, self.tangent, self.step)
         if ahead is None:
-            beyond = around_corner(family, here, tangent)
-            if beyond is None:
-                return HalfBranch(points, _at(family, here, "no cycle is found further on, however short the step"))
-            corner, (here, tangent, step) = beyond
-            if corner is not None and bounds[0] <= corner.cycle.parameter <= bounds[1]:
-                points.append(branch_point(family, curve, corner.cycle, corner))
-            points.append(here)
-            continue
-        following, turned, step = ahead
-        last = branch_point(family, curve, following)
-        if not last.is_real:
-            changed = change_of_modes(family, here, tangent, step)
-            if changed is None:
-                if step > 100 * SHORTEST:
-                    step *= 0.25
-                    continue
-                return HalfBranch(points, _at(family, here, "the contact modes change in a way that is not understood"))
-            special, onward = changed
-            if not bounds[0] <= special.cycle.parameter <= bounds[1]:
-                return _to_bound(family, points, here, tangent, special.cycle, bounds)
-            if special.curve is curve:
-                # The parameter may turn back just there.
-                passed = _specials(family, curve, here.cycle, tangent, special.cycle)
-                points += [one for one in passed if np.linalg.norm(one.cycle.u - special.cycle.u) > 1e-6]
-            # The rebounds of a landing that begins to have them are as short as those that are left out.
-            begins = (
-                family.name.startswith("restitution") and special.cycle.parameter < 1e-5 and "impact" in special.name
-            )
-            at_change = branch_point(family, special.curve, special.cycle, None if begins else special)
-            if onward is not None or at_change.real is not None:
-                points.append(at_change)
-            onward = onward or over_a_gap()
-            if onward is None:
-                return HalfBranch(points, _at(family, at_change, f"{special.name}: no cycle was found to go on beyond"))
-            here, tangent, step = onward
-            continue
-        born = halves.born_between(family, curve, here.cycle, following)
-        if born is not None and bounds[0] <= born.cycle.parameter <= bounds[1]:
-            why = "the two halves of the cycle become one, whose period doubles there"
-            return HalfBranch([*halves.without_seeming_folds(points, born), born], _at(family, born, why))
-        passed = _specials(family, curve, here.cycle, tangent, following)
-        points += [point for point in passed if bounds[0] <= point.cycle.parameter <= bounds[1]]
-        if not bounds[0] <= following.parameter <= bounds[1]:
-            return _to_bound(family, points, here, following.u - here.cycle.u, following, bounds)
-        if (met := _met_before([start, *points], last)) is not None:
-            if met.onwards:
-                return HalfBranch(points, _at(family, start, "the branch is back where it began"), closed=True)
-            # What goes on there in truth has other modes: a chain of rebounds that no longer ends, say.
-            points = points[: met.turned]
-            onward = over_a_gap()
-            if onward is None:
-                why = "the branch would come back on itself, and nothing else was found to go on"
-                return HalfBranch(points, _at(family, [start, *points][-1], why))
-            here, tangent, step = onward
-            continue
-        points.append(last)
+            return self._around_corner()
+        following, turned, self.step = ahead
+        last = branch_point(self.family, self.here.curve, following)
+        return self._come_to(last, turned) if last.is_real else self._through_change_of_modes()
+
+    def _around_corner(self) -> HalfBranch | None:
+        beyond = around_corner(self.family, self.here, self.tangent)
+        if beyond is None:
+            return self.ended(self.here, "no cycle is found further on, however short the step")
+        curve, (corner, onward) = self.here.curve, beyond
+        if corner is not None and self._within(corner.cycle):
+            self.points.append(branch_point(self.family, curve, corner.cycle, corner))
+        self.here, self.tangent, self.step = onward
+        self.points.append(self.here)
+        return None
+
+    def _through_change_of_modes(self) -> HalfBranch | None:
+        family, here, curve = self.family, self.here, self.here.curve
+        changed = change_of_modes(family, here, self.tangent, self.step)
+        if changed is None:
+            if self.step > 100 * SHORTEST:
+                self.step *= 0.25
+                return None
+            return self.ended(here, "the contact modes change in a way that is not understood")
+        special, onward = changed
+        if not self._within(special.cycle):
+            return self._to_bound(self.tangent, special.cycle)
+        if special.curve is curve:
+            # The parameter may turn back just there.
+            passed = _specials(family, curve, here.cycle, self.tangent, special.cycle)
+            self.points += [one for one in passed if np.linalg.norm(one.cycle.u - special.cycle.u) > 1e-6]
+        # The rebounds of a landing that begins to have them are as short as those that are left out.
+        begins = family.name.startswith("restitution") and special.cycle.parameter < 1e-5 and "impact" in special.name
+        at_change = branch_point(family, special.curve, special.cycle, None if begins else special)
+        if onward is not None or at_change.real is not None:
+            self.points.append(at_change)
+        if onward is None:
+            return self._over_a_gap(at_change, f"{special.name}: no cycle was found to go on beyond")
+        self.here, self.tangent, self.step = onward
+        return None
+
+    def _come_to(self, last: BranchPoint, turned: Float[np.ndarray, " m"]) -> HalfBranch | None:
+        """To a cycle of the same contact modes, where the tangent is `turned`."""
+        # A branch of pure sliding ends at the equilibrium once its cycle has shrunk to this share of its first size.
+        small = 0.02
+        family, here, curve, following = self.family, self.here.cycle, self.here.curve, last.cycle
+        born = halves.born_between(family, curve, here, following)
+        if born is not None and self._within(born.cycle):
+            self.points = [*halves.without_seeming_folds(self.points, born), born]
+            return self.ended(born, "the two halves of the cycle become one, whose period doubles there")
+        self.points += [
+            one for one in _specials(family, curve, here, self.tangent, following) if self._within(one.cycle)
+        ]
+        if not self._within(following):
+            return self._to_bound(following.u - here.u, following)
+        if (met := _met_before([self.start, *self.points], last)) is not None:
+            return self._back_on_itself(met)
+        self.points.append(last)
         if _smallness(curve, following) < small:
-            end = _where_sliding_is_met(family, last)
-            if end is None:
-                return HalfBranch(points, _at(family, last, "the amplitude goes to zero"))
-            return HalfBranch(
-                [*points, end],
-                f"At {family.name} = {end.cycle.parameter:.13g} the amplitude meets the sliding equilibrium, whose stability "
-                f"changes there.",
-            )
-        easy = following.iterations <= 3
-        step = min(step * ((soon if step < FIRST else later) if easy else 0.7), LONGEST)
-        here, tangent = with_own_rebounds(family, last, turned)
-    return HalfBranch(points, _at(family, here, f"`points` = {most} points are computed"))
+            return self._at_equilibrium(last)
+        # After a step that converged quickly, the next is longer: by the first factor below the length `FIRST`, by the second
+        # above.
+        soon, later = 3.0, 1.5
+        longer = (soon if self.step < FIRST else later) if following.iterations <= 3 else 0.7
+        self.step = min(self.step * longer, LONGEST)
+        self.here, self.tangent = with_own_rebounds(family, last, turned)
+        return None
+
+    def _back_on_itself(self, met: "_Met") -> HalfBranch | None:
+        if met.onwards:
+            return self.ended(self.start, "the branch is back where it began")._replace(closed=True)
+        # What goes on there in truth has other modes: a chain of rebounds that no longer ends, say.
+        self.points = self.points[: met.turned]
+        why = "the branch would come back on itself, and nothing else was found to go on"
+        return self._over_a_gap([self.start, *self.points][-1], why)
+
+    def _at_equilibrium(self, last: BranchPoint) -> HalfBranch:
+        end = _where_sliding_is_met(self.family, last)
+        if end is None:
+            return self.ended(last, "the amplitude goes to zero")
+        return HalfBranch(
+            [*self.points, end],
+            f"At {self.family.name} = {end.cycle.parameter:.13g} the amplitude meets the sliding equilibrium, whose stability "
+            f"changes there.",
+        )
+
+    def _to_bound(self, along: Float[np.ndarray, " m"], beyond: ComputedCycle) -> HalfBranch:
+        """The points up to a bound of the parameter, which lies between the front and what is `beyond` it in the direction
+        `along`: with the cycle at the bound, if it is found.
+        """
+        family, here = self.family, self.here
+        bound = self.bounds[0] if beyond.parameter < self.bounds[0] else self.bounds[1]
+        reached = f"The bound {family.name} = {bound:.10g} is reached."
+        if not self.points and here.cycle.parameter == bound:
+            return HalfBranch([], reached)
+        share = (bound - here.cycle.parameter) / (along[-1] * family.scale)
+        at = here.curve.at_parameter(here.cycle.u + share * along, bound)
+        last = [] if at is None else [branch_point(family, here.curve, at)]
+        return HalfBranch(self.points + [point for point in last if point.is_real], reached)
+
+    def _over_a_gap(self, at: BranchPoint, otherwise: str) -> HalfBranch | None:
+        """Beyond a gap, where the next cycles cannot be followed; where nothing is found there, the branch ends for this
+        reason. The parameter may turn back there, but not to where the branch has come from.
+        """
+        # Beyond a gap a branch may come back on itself, again and again.
+        most_gaps = 16
+        self.gaps += 1
+        before, last = [self.start, self.start, *self.points][-2:]
+        onwards = np.sign(last.cycle.parameter - before.cycle.parameter) or self.sense
+        ways = (onwards, -onwards) if self.points else (self.sense,)
+        for way, near in itertools.product(ways, (last, before)) if self.gaps <= most_gaps else ():
+            # At a special point rounding tells how the motion goes on.
+            found = cycle_beyond(self.family, near, last.cycle.parameter, way)
+            if found is None or not self._within(found.cycle):
+                continue
+            if _met_before([self.start, *self.points, found], found) is None:
+                grazes = _grazing_between(self.family, last, found)
+                self.points += [found] if grazes is None else [grazes, found]
+                tangent = found.curve.tangent(found.cycle, None)
+                self.here, self.tangent, self.step = found, tangent * np.sign(way * tangent[-1]), FIRST
+                return None
+        return self.ended(at, otherwise)
 
 
 def _ahead(
@@ -147,54 +208,8 @@ def _ahead(
         step *= 0.5
 
 
-def _to_bound(
-    family: Family,
-    points: list[BranchPoint],
-    here: BranchPoint,
-    along: Float[np.ndarray, " m"],
-    beyond: ComputedCycle,
-    bounds: tuple[float, float],
-) -> HalfBranch:
-    """The points up to a bound of the parameter, which lies between a point and what is `beyond` it in the direction `along`:
-    with the cycle at the bound, if it is found.
-    """
-    bound = bounds[0] if beyond.parameter < bounds[0] else bounds[1]
-    reached = f"The bound {family.name} = {bound:.10g} is reached."
-    if not points and here.cycle.parameter == bound:
-        return HalfBranch([], reached)
-    share = (bound - here.cycle.parameter) / (along[-1] * family.scale)
-    at = here.curve.at_parameter(here.cycle.u + share * along, bound)
-    last = [] if at is None else [branch_point(family, here.curve, at)]
-    return HalfBranch(points + [point for point in last if point.is_real], reached)
-
-
-def _at(family: Family, point: BranchPoint, why: str) -> str:
-    return f"At {family.name} = {point.cycle.parameter:.12g} {why}."
-
-
 def _specials(family: Family, curve: Curve, a: ComputedCycle, tangent, b: ComputedCycle) -> list[BranchPoint]:
     return [branch_point(family, curve, special.cycle, special) for special in between(curve, a, tangent, b)]
-
-
-def _over_a_gap(
-    family: Family, points: list[BranchPoint], start: BranchPoint, sense: float, bounds: tuple[float, float]
-):
-    """The point, tangent and step with which to go on where the next cycles cannot be followed; the point is added. The
-    parameter may turn back there, but not to where the branch has come from.
-    """
-    before, last = [start, start, *points][-2:]
-    onwards = np.sign(last.cycle.parameter - before.cycle.parameter) or sense
-    for way, near in itertools.product((onwards, -onwards) if points else (sense,), (last, before)):
-        # At a special point rounding tells how the motion goes on.
-        found = cycle_beyond(family, near, last.cycle.parameter, way)
-        if found is None or not bounds[0] <= found.cycle.parameter <= bounds[1]:
-            continue
-        if _met_before([start, *points, found], found) is None:
-            grazes = _grazing_between(family, last, found)
-            points += [found] if grazes is None else [grazes, found]
-            tangent = found.curve.tangent(found.cycle, None)
-            return found, tangent * np.sign(way * tangent[-1]), FIRST
-    return None
 
 
 def _grazing_between(family: Family, last: BranchPoint, found: BranchPoint) -> BranchPoint | None:
