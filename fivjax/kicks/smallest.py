@@ -245,7 +245,7 @@ def _descended(scene: Scene, p: float, duration: float, shortest: float, longest
         if here is None or abs(here.d_p["duration"]) * duration < LEVEL * (here.p - 1):
             break
         slope = here.d_p["duration"]
-        d = float(np.clip(duration - np.sign(slope) * step, max(shortest, 1e-6), longest))
+        d = float(np.clip(duration - np.sign(slope) * step, max(shortest, 1e-6 * longest), longest))
         # A tangent may lead to no kick at all; near a guess that is too far off nothing is found, and the step is shortened.
         guess = max(here.p + slope * (d - duration), 1 + 0.25 * (here.p - 1))
         following = critical(d, guess) if d != duration else None

@@ -106,7 +106,7 @@ def tradeoff(
         exact = EventExact(order=20, tolerance=1e-16)
         stage("reference")
         reference = _end_state(scene, exact, t1)
-        edge = _boundary(scene, exact, p) if boundary else None
+        edge = _boundary(scene, exact, p, t1) if boundary else None
         for (name, kind), method in rows.items():
             stage(f"{name}, {kind}")
             place = list(methods).index(name), precisions.index(kind)
@@ -262,7 +262,7 @@ def _timed(function: Callable) -> float:
     return min(walls)
 
 
-def _boundary(scene: Scene, exact: AbstractStepper, p) -> Callable[[AbstractStepper], dict[str, float]]:
+def _boundary(scene: Scene, exact: AbstractStepper, p, t1: float) -> Callable[[AbstractStepper], dict[str, float]]:
     """A function that gives a method's errors in p_crit and in the verdicts of a row of kicks; none if there is no p_crit."""
     # One value of some axis; each of several contacts may have its own belt speed, which is none.
     name = "force" if np.ndim(scene.belt_speed) else "belt_speed"
@@ -282,7 +282,7 @@ def _boundary(scene: Scene, exact: AbstractStepper, p) -> Callable[[AbstractStep
             return shares
         near = (max(0.0, p_crit - 0.05), p_crit + 0.05)
         # A weak cycle may take longer to draw a motion in; but with steps of one size that takes minutes.
-        t_max = None if isinstance(method, EventExact) else 10.0
+        t_max = None if isinstance(method, EventExact) else 20 * t1
         own = critical_perturbation(
             scene, **now, p_range=near, p_step=0.01, tolerance=1e-5, method=method, t_max=t_max, progress=False
         )

@@ -44,7 +44,7 @@ def verdicts_from(
     values = {name: np.ascontiguousarray(states[:, place]) for name, place in places.items()}
     scene, options = under_final_load(scene), RunOptions(label, progress=False, all_or_none=True)
     listed = TrajectoryList(values, places)
-    return run_to_verdict(scene, listed, EventExact(), Limits(30.0), options, attractors=attractors).verdict
+    return run_to_verdict(scene, listed, EventExact(), Limits(), options, attractors=attractors).verdict
 
 
 @in_own_coordinates

@@ -67,15 +67,15 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     eigenvalues, vectors = (part.astype(complex) for part in np.linalg.eig(matrix))
     # A defective matrix has no modal coordinates. Infinite entries make every bound infinite, so nothing is proved.
     inverse = np.full(vectors.shape, np.inf, complex)
-    condition = np.where(finite, np.linalg.cond(vectors), np.inf)
+    condition = np.where(finite, _condition(eigenvalues, vectors), np.inf)
     # States are computed from modal coordinates only where the condition number of the modes is below this.
-    well_conditioned = condition < 1e5
+    well_conditioned = condition < 1e4
     # Without damping, motions go on for ever unless modes have coalesced: real parts are rounding errors.
     half = matrix.shape[-1] // 2
     undamped = np.all(matrix[:, half:, half:] == 0, axis=(1, 2)) & well_conditioned
     undamped &= np.all(np.abs(eigenvalues.real) <= 1e-10 * np.abs(eigenvalues), axis=-1)
     eigenvalues.real[undamped] = 0.0
-    regular = condition < 1e12
+    regular = condition < 1e9
     inverse[regular] = np.linalg.inv(vectors[regular])
     # Sorted so that the upper half plane comes first; the conjugates are then cut off.
     order = np.argsort(-eigenvalues.imag, axis=-1, kind="stable")
@@ -99,6 +99,16 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         slowest_period=_slowest_period(eigenvalues),
         stable=regular & (decays | undamped),
     )
+
+
+def _condition(eigenvalues: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """The condition numbers of modes, whatever the units: with displacements times a typical frequency beside velocities."""
+    moving = eigenvalues != 0
+    sizes = np.log(np.abs(np.where(moving, eigenvalues, 1.0)))
+    typical = np.exp(np.sum(sizes, axis=-1) / np.maximum(np.sum(moving, axis=-1), 1))
+    half = vectors.shape[-1] // 2
+    scaled = np.concatenate([vectors[:, :half] * typical[:, None, None], vectors[:, half:]], axis=1)
+    return np.linalg.cond(scaled / np.linalg.norm(scaled, axis=1, keepdims=True))
 
 
 def _of_modes(
