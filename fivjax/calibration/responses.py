@@ -13,9 +13,10 @@ from ..foundation.carried import depending_on
 from ..foundation.polynomial import value_and_rate
 from ..io.recordings import QUANTITIES, Channel
 from ..kernels.functions import KernelFunction
+from ..model.load import load_from, next_jump
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
-from ..simulation.jump_instants import load_from, next_jump, start_of_run
+from ..simulation.jump_instants import start_of_run
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.core import end_after, next_part
 from ..steppers.event_exact import for_derivatives

@@ -81,6 +81,8 @@ def _applied(equation, operands: list, length: int) -> list:
         return list(found) if primitive.multiple_results else [found]
     if name in LINEAR:
         return _linear(primitive, params, operands, LINEAR[name], length)
+    if name == "pow" and not isinstance(operands[1], Series):
+        return [Series(_constant_power(operands[0].terms, operands[1]))]
     terms = [_terms(part, length) for part in operands]
     if name in ("mul", "dot_general"):
         left, right = terms
@@ -180,19 +182,42 @@ def _whole_power(u: Sequence[Array], y: int) -> tuple[Array, ...]:
 
 
 def _any_power(u: Sequence[Array], exponent: Sequence[Array]) -> tuple[Array, ...]:
-    fixed = not any(isinstance(term, jax.core.Tracer) for term in exponent) and not any(map(np.any, exponent[1:]))
-    if (
-        fixed
-        and np.all(exponent[0] == np.round(exponent[0]))
-        and np.ptp(exponent[0]) == 0
-        and abs(np.max(exponent[0])) < 64
-    ):
-        return _whole_power(u, int(np.max(exponent[0])))
-    if fixed:
-        return _power(u, exponent[0])
     (logarithm,) = _through(jnp.log, Series(tuple(u)))
     inner = _product(exponent, logarithm.terms)
     return _by_itself(jnp.exp(inner[0]), inner, 0.0, 1.0, 0.0)
+
+
+def _constant_power(u: Sequence[Array], exponent) -> tuple[Array, ...]:
+    """Where the base is zero, there is a series for whole exponents only, and no derivative by the exponent (which has a
+    logarithm in it).
+    """
+    if not isinstance(exponent, jax.core.Tracer):
+        values = np.unique(exponent)
+        if len(values) == 1 and values[0] == np.round(values[0]) and abs(values[0]) < 64:
+            return _whole_power(u, int(values[0]))
+    zero = u[0] == 0
+    found = _power((jnp.where(zero, 1.0, u[0]), *u[1:]), exponent)
+    # There u is t times a series, and its power that of this series, shifted by the exponent.
+    fixed = jax.lax.stop_gradient(exponent)
+    rest = _power((jnp.where(zero, u[1], 1.0), *u[2:], jnp.zeros_like(u[0])), fixed)
+    whole = (fixed >= 0) & (fixed == jnp.round(fixed))
+    at_zero = []
+    for k in range(len(u)):
+        shifted = sum(jnp.where(fixed == m, rest[k - m], 0.0) for m in range(k + 1))
+        at_zero.append(jnp.where(whole, shifted, jnp.where(fixed > k, 0.0, jnp.nan)))
+    return tuple(jnp.where(zero, _not_along(own, exponent), other) for own, other in zip(at_zero, found, strict=True))
+
+
+@jax.custom_jvp
+def _not_along(value: Array, parameter: Array) -> Array:
+    """A value that has no derivative by a parameter."""
+    return value + 0.0 * parameter
+
+
+@_not_along.defjvp
+def _(primals, tangents):
+    moved, along = tangents
+    return _not_along(*primals), jnp.where(along == 0, moved, jnp.nan)
 
 
 def _chosen(first, a: Sequence[Array], b: Sequence[Array]) -> list[Array]:

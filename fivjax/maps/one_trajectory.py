@@ -12,12 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, State
-from ..model.load import AbstractLoad
+from ..model.load import AbstractLoad, next_jump
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
 from ..simulation.ending import UNBOUNDED_FROM
 from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
-from ..simulation.jump_instants import next_jump
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment, end_after
 from ..verdicts.sliding_proof import margin_share_bound

@@ -166,3 +166,14 @@ class Pulse(AbstractLoad):
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         kicked = (t >= self.start) & (t < self.start + self.duration)
         return jnp.where(kicked, self.p * self.force, self.force)
+
+
+def next_jump(load: AbstractLoad, t: Float[Array, ""]) -> Float[Array, ""]:
+    """The first jump of the load after an instant (s); infinite where there is none."""
+    return jnp.min(jnp.where(load.jumps > t, load.jumps, jnp.inf), initial=jnp.inf)
+
+
+def load_from(load: AbstractLoad, t: Float[Array, ""]) -> Float[Array, ""]:
+    """The load (N) from an instant (s) up to its next jump."""
+    until = next_jump(load, t)
+    return load(jnp.where(jnp.isfinite(until), 0.5 * (t + until), t + 1.0))

@@ -26,8 +26,8 @@ UNBOUNDED_FROM = 1e9
 
 ENDING = {
     Ending.FINISHED: "reached its end",
-    Ending.NOT_FINITE: "the state stopped being finite, and the rows from there on are NaN; take a smaller step or check the "
-    "parameters",
+    Ending.NOT_FINITE: "the state stopped being finite, and the rows from there on are NaN; take a smaller step, check the "
+    "parameters, or take a friction law with a Taylor series at zero slip (v**1.5 has none)",
     Ending.NO_EQUILIBRIUM: "there is no steady sliding to start from, and all rows are NaN; change the load, its direction or "
     "the friction, or give `y0`",
     Ending.PAINLEVE: "the contact problem has no unique solution at this friction (Painlevé), so the motion is one of several; "

@@ -22,6 +22,7 @@ from ..foundation.compiling import power_of_4
 from ..foundation.precision import in_double_precision, is_known
 from ..io.datasets import labelled
 from ..kernels.functions import KernelFunction
+from ..model.load import next_jump
 from ..model.scene import Scene, refuse_vector_contacts
 from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment, follow
@@ -29,7 +30,6 @@ from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 from . import energy as accounts
 from .energy import Energy, EnergyData, Ledger
-from .jump_instants import next_jump
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:

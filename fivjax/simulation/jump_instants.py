@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
-from ..model.load import AbstractLoad
 from ..model.scene import Scene
 from ..steppers.base import advance_between, rates
 from ..steppers.core import Segment, nothing
@@ -28,17 +27,6 @@ class StartOfRun(eqx.Module, Generic[Total]):
     t: Float[Array, ""]  # s
     y: State
     total: Total
-
-
-def next_jump(load: AbstractLoad, t: Float[Array, ""]) -> Float[Array, ""]:
-    """The first jump of the load after an instant (s); infinite where there is none."""
-    return jnp.min(jnp.where(load.jumps > t, load.jumps, jnp.inf), initial=jnp.inf)
-
-
-def load_from(load: AbstractLoad, t: Float[Array, ""]) -> Float[Array, ""]:
-    """The load (N) from an instant (s) up to its next jump."""
-    until = next_jump(load, t)
-    return load(jnp.where(jnp.isfinite(until), 0.5 * (t + until), t + 1.0))
 
 
 def load_before(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:

@@ -17,6 +17,7 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.polynomial import value_and_rate
 from ..kernels.functions import KernelFunction
+from ..model.load import load_from, next_jump
 from ..model.scene import Scene
 from ..steppers.base import advance_between
 from ..steppers.core import Segment, end_after, next_part
@@ -24,7 +25,7 @@ from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .ending import Ending
 from .energy import EnergyData, Ledger
-from .jump_instants import StartOfRun, load_from, next_jump, start_of_run
+from .jump_instants import StartOfRun, start_of_run
 from .rows import contact_after_jump, grown, row_of
 from .start import at_equilibrium
 

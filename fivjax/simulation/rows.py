@@ -17,6 +17,7 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.compiling import compiled
 from ..foundation.precision import known_to_numpy
 from ..foundation.progress import stage, tick
+from ..model.load import load_from
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper
@@ -24,7 +25,7 @@ from ..steppers.core import Segment
 from . import energy as accounts
 from .ending import UNBOUNDED_FROM
 from .energy import EnergyData, Ledger
-from .jump_instants import StartOfRun, load_before, load_from, moment, start_of_run
+from .jump_instants import StartOfRun, load_before, moment, start_of_run
 from .stretches import Begin, go_on
 
 # Intervals between saved instants in a part.

@@ -4,8 +4,8 @@ They integrate the smooth vector field of the present status, find with `contact
 carry the status in their solver state. They work in a plain `diffrax.diffeqsolve`:
 
     sol = diffrax.diffeqsolve(
-        diffrax.ODETerm(fj.vector_field), fj.WhereSwitched(diffrax.Tsit5()), t0, t1, dt0, y0, args=scene,
-        stepsize_controller=diffrax.StepTo(ts),
+        diffrax.ODETerm(fj.vector_field), fj.WhereSwitched(diffrax.Tsit5()), t0, t1, None, y0, args=scene,
+        stepsize_controller=diffrax.StepTo(ts),  # instants that have those of `scene.load.jumps` among them
     )
 
 The state `y` is the displacements followed by the velocities, in m and m/s; `args` is the scene.
@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
+from ..foundation import arguments
 from ..model.scene import Scene
 from .section import Rise, rise_between
 
@@ -44,9 +45,19 @@ def vector_field(t: Float[Array, ""], y: State, args: Scene) -> State:
         >>> import diffrax
         >>> term = diffrax.ODETerm(fj.vector_field)  # for a plain `diffrax.diffeqsolve`, with the scene as `args`
     """
+    _check(y, args)
     mechanics, load = Mechanics(args), args.load(t)
     contact = physics.status_from_forces(mechanics, load, y)
     return rates(mechanics, contact, load, y)
+
+
+def _check(y: State, args: Scene) -> None:
+    arguments.instance("args", args, Scene, "the scene, as in `diffeqsolve(..., args=scene)`")
+    if y.dtype != args.belt_speed.dtype:
+        raise TypeError(
+            f"The state must have the type of the scene's numbers, {args.belt_speed.dtype}, but has {y.dtype}. Turn on double "
+            "precision around the call: `with jax.enable_x64(True):`."
+        )
 
 
 def rates(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> State:
@@ -129,6 +140,13 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
         """States inside an advance of duration `h` (s), and weights that integrate over it to the method's order."""
 
     def init(self, terms, t0, t1, y0: State, args: Scene) -> StepperState:
+        _check(y0, args)
+        # diffrax wraps a term, in order to turn time around.
+        if getattr(terms, "term", terms).vector_field is not vector_field:
+            raise ValueError("The term must be `diffrax.ODETerm(fj.vector_field)`: a stepper knows of no other motion.")
+        y0 = eqx.error_if(
+            y0, getattr(terms, "direction", 1) < 0, "`t1` must be after `t0`: friction has no way back in time."
+        )
         mechanics = Mechanics(args)
         return StepperState(mechanics, physics.status_from_forces(mechanics, args.load(0.5 * (t0 + t1)), y0))
 

@@ -20,10 +20,12 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
 from ..contact.rounding import RESTING
 from ..foundation import arguments
+from ..foundation.carried import depending_on
 from ..foundation.polynomial import in_shares, value_and_slope
+from ..model.load import AbstractLoad, load_from, next_jump
 from ..model.scene import Scene
-from .base import AbstractStepper, Advance, StepperState, Within, advance_between
-from .core import follow
+from .base import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_between
+from .core import end_after, next_part
 from .guard_roots import implicit_root, march_to_roots, together
 from .law_agreement import agreeing
 from .motion_series import MotionSeries, fastest_in_mode, guard_rounding, series_of
@@ -44,6 +46,9 @@ class EventExact(AbstractStepper):
     - A guard that starts at zero, because the status has just begun there, does not fire at its own start.
     - After an event the state is put exactly on its constraint, and the next status follows from the forces.
 
+    In a plain `diffeqsolve` the load may jump within a step. A derivative by the instant of a jump is lost where a step ends on
+    that very instant.
+
     Event times are differentiable in forward and reverse mode, as roots of the series, by the implicit function.
 
     **Arguments:** `order` of the series; `tolerance`, the size of its last terms relative to the motion, which limits the
@@ -58,8 +63,8 @@ class EventExact(AbstractStepper):
     """
 
     order_: int = eqx.field(static=True)
-    tolerance: float
-    dt: float
+    tolerance: float = eqx.field(static=True)
+    dt: float = eqx.field(static=True)
     for_deviations: bool = eqx.field(static=True)
 
     round: ClassVar = 64
@@ -82,12 +87,12 @@ class EventExact(AbstractStepper):
 
     def step(self, terms, t0, t1, y0: State, args: Scene, solver_state: StepperState, made_jump):
         mechanics, contact = solver_state.mechanics, solver_state.contact
-        # Steps end at jumps of the load, so the load at mid-step is that of the whole step.
-        load = args.load(0.5 * (t0 + t1))
-        after = follow(self, mechanics, contact, load, y0, t1 - t0)
-        dense_info = {"y0": y0, "contact": contact, "mechanics": mechanics, "load": load, "stepper": self}
-        result = diffrax.RESULTS.where(after.enough, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
-        return after.y, None, dense_info, StepperState(mechanics, after.contact), result
+        # diffrax fills what it has not reached with infinity, which is no whole number.
+        mode = jax.tree.map(lambda part: part.astype(y0.dtype), contact)
+        dense_info = {"y0": y0, "mode": mode, "mechanics": mechanics, "load": args.load, "stepper": self}
+        y, contact, enough = _through_jumps(self, mechanics, contact, args.load, y0, t0, t1)
+        result = diffrax.RESULTS.where(enough, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
+        return y, None, dense_info, StepperState(mechanics, contact), result
 
     def advance(
         self,
@@ -267,13 +272,42 @@ class _Restepped(AbstractLocalInterpolation):
     t0: Float[Array, ""]
     t1: Float[Array, ""]
     y0: State
-    contact: Contact
+    mode: Contact  # as numbers of the type of the state
     mechanics: Mechanics
-    load: Float[Array, ""]
+    load: AbstractLoad
     stepper: EventExact
 
     def evaluate(self, t0, t1=None, left=True):
         del left
         if t1 is not None:
             return self.evaluate(t1) - self.evaluate(t0)
-        return follow(self.stepper, self.mechanics, self.contact, self.load, self.y0, t0 - self.t0).y
+        contact = Contact(self.mode.status.astype(jnp.int32), self.mode.direction)
+        return _through_jumps(self.stepper, self.mechanics, contact, self.load, self.y0, self.t0, t0)[0]
+
+
+def _through_jumps(
+    stepper: EventExact,
+    mechanics: Mechanics,
+    contact: Contact,
+    load: AbstractLoad,
+    y: State,
+    t0: Float[Array, ""],
+    t1: Float[Array, ""],
+) -> tuple[State, Contact, Bool[Array, ""]]:
+    """The state and contact mode at `t1` (s), from those at `t0`, under a load that may jump in between; and whether the number
+    of advances was enough.
+    """
+
+    def body(carry):
+        t, y, contact = carry
+        until = jnp.minimum(next_jump(load, t), t1)
+        part, is_last = next_part(until - t, stepper.dt)
+        after = stepper.advance(mechanics, contact, load_from(load, t), y, part)
+        return end_after(after, t, until, is_last), after.y, after.contact
+
+    def going(carry):
+        return carry[0] < t1
+
+    begin = depending_on((mechanics, load, y, t1), (jnp.asarray(t0, y.dtype), y, contact))
+    t, y, contact = eqx.internal.while_loop(going, body, begin, max_steps=MOST_ADVANCES, kind="bounded")
+    return y, contact, ~(t < t1)

@@ -32,6 +32,27 @@ def test_the_series_is_the_law_and_smoothness_is_read_from_its_code(law, smooth)
         assert is_smooth(law, jnp.asarray(AT)) is smooth
 
 
+@pytest.mark.parametrize(
+    ("exponent", "exact"), [(0.0, [1, 0, 0, 0, 0]), (1.0, [0, 1, 1, 0, 0]), (3.0, [0, 0, 0, 1, 3])]
+)
+def test_a_power_of_nothing_has_the_series_of_a_whole_exponent_that_is_a_parameter(exponent, exact):
+    """Rejects logarithms and divisions by the base: (x + x²)ⁿ about x = 0."""
+
+    def series(exponent):
+        return jnp.stack(taylor_coefficients(lambda x: (x + x * x) ** exponent, jnp.zeros(()), 4))
+
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(jax.jit(series)(exponent), exact, atol=1e-15)
+        # The derivative by the exponent has a logarithm.
+        assert np.all(np.isnan(jax.jit(jax.jacfwd(series))(exponent)))
+
+
+def test_a_power_of_nothing_has_no_series_between_whole_exponents():
+    with jax.enable_x64(True):
+        found = taylor_coefficients(lambda x: x**1.5, jnp.zeros(()), 4)
+    np.testing.assert_array_equal(found, [0, 0, *[np.nan] * 3])
+
+
 def test_a_loop_whose_length_depends_on_the_argument_may_have_kinks():
     """Rejects calling smooth what ends a loop by its argument."""
     halved = lambda x: jax.lax.while_loop(lambda y: y > 1.0, lambda y: 0.5 * y, x)  # noqa: E731

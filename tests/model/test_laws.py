@@ -147,3 +147,46 @@ class FromOutside(fj.AbstractFriction):
 def test_a_law_is_followed_by_a_kernel_if_its_trace_can_be_written(law, by_kernel):
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.3), belt_speed=1.0, load=fj.ConstantLoad(100.0))
     assert has_kernel(eqx.tree_at(lambda scene: scene.friction, scene, law), fj.EventExact()) == by_kernel
+
+
+class Stribeck(fj.AbstractFriction):
+    """Falls as exp(-(v/v_s)^δ); its exponent is a parameter."""
+
+    mu_static: float
+    mu_dynamic: float
+    v_s: float
+    delta: float
+
+    def __call__(self, slip_speed):
+        falls = jnp.exp(-((slip_speed / self.v_s) ** self.delta))
+        return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * falls
+
+
+def test_a_power_law_begins_to_slip_after_it_has_stuck():
+    """Against SciPy: the block sticks until its spring pulls with the static friction, slips, and sticks again."""
+    scene, belt_speed = block(Stribeck(0.4, 0.2, 0.5, 2.0), 0.1), 0.1
+    first = (0.4 - 0.05 * belt_speed) / belt_speed  # s, from rest at zero on the belt
+
+    def motion(_, y):
+        slip = max(belt_speed - y[1], 0.0)
+        return [y[1], 0.2 + 0.2 * np.exp(-((slip / 0.5) ** 2)) - y[0] - 0.05 * y[1]]
+
+    def sticks(t, y):
+        return y[1] - belt_speed + (1.0 if t < first + 0.1 else 0.0)
+
+    sticks.terminal, sticks.direction = True, 1
+    exact = solve_ivp(
+        motion,
+        (first, 30.0),
+        [0.4 - 0.05 * belt_speed, belt_speed],
+        rtol=1e-12,
+        atol=1e-14,
+        events=sticks,
+        dense_output=True,
+    )
+    again = exact.t_events[0][0]
+    run = fj.simulate(scene, 10.0, 0.01, y0=([0.0, 0.0], [belt_speed, 0.0]))
+    assert run.meaning == "reached its end"
+    slips = (run.t > first) & (run.t < again)
+    np.testing.assert_array_equal(run.status == fj.Status.SLIDE, slips)
+    np.testing.assert_allclose(run.velocity[slips, 0], exact.sol(run.t[slips])[1], atol=1e-9)

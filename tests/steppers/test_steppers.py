@@ -181,8 +181,10 @@ def test_plain_diffeqsolve_gives_what_simulate_gives(paper_scene):
 
 
 def test_event_exact_interpolates_through_events_inside_a_step(paper_scene):
-    """The other stepper is one too, and its dense output as exact as the step, also with several events inside one."""
-    scene = paper_scene.replace(p=2.0)
+    """The other stepper is one too, and its dense output as exact as the step, also with several events inside one, and with a
+    jump of the load.
+    """
+    scene = paper_scene.replace(p=2.0, duration=0.1234)
     run = fj.simulate(scene, 0.3, 0.3 / 63, LOW_ORDER)
     with jax.enable_x64(True):
         solution = diffrax.diffeqsolve(
@@ -194,14 +196,40 @@ def test_event_exact_interpolates_through_events_inside_a_step(paper_scene):
             jnp.concatenate([run.displacement[0], run.velocity[0]]),
             args=scene,
             stepsize_controller=diffrax.StepTo(jnp.array([0.0, 0.1, 0.2, 0.3])),
-            saveat=diffrax.SaveAt(ts=jnp.asarray(run.t)),
+            saveat=diffrax.SaveAt(ts=jnp.asarray(run.t), dense=True),
         )
+        dense = jax.jit(jax.vmap(solution.evaluate))(jnp.asarray(run.t[1:]))
     assert np.count_nonzero(np.diff(run.status)) > 15
     # Rounding, multiplied by the growth of differences through some thirty events.
     ys = np.asarray(solution.ys)
     assert solution.result == diffrax.RESULTS.successful
     np.testing.assert_allclose(ys[:, :3], run.displacement, atol=1e-13)
     np.testing.assert_allclose(ys[:, 3:], run.velocity, atol=1e-10)
+    np.testing.assert_allclose(dense, ys[1:], atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "sentence"),
+    [
+        ({"args": None}, TypeError, "Argument `args` must be the scene"),
+        ({"double": False}, TypeError, "Turn on double precision around the call"),
+        ({"terms": diffrax.ODETerm(lambda t, y, args: -y)}, ValueError, "a stepper knows of no other motion"),
+        ({"t1": -0.1, "dt0": -0.05}, RuntimeError, "friction has no way back in time"),
+    ],
+    ids=["scene", "precision", "term", "time"],
+)
+def test_diffeqsolve_with_a_stepper_is_refused_by_a_sentence(paper_scene, change, kind, sentence):
+    given = {
+        "terms": diffrax.ODETerm(fj.vector_field),
+        "t1": 0.1,
+        "dt0": 0.1,
+        "args": paper_scene,
+        "double": True,
+        **change,
+    }
+    terms, t1, double = (given.pop(name) for name in ("terms", "t1", "double"))
+    with jax.enable_x64(double), pytest.raises(kind, match=sentence):
+        diffrax.diffeqsolve(terms, fj.WhereSwitched(), 0.0, t1, y0=jnp.zeros(6), **given)
 
 
 def test_a_grazing_dip_inside_one_advance_is_found():
