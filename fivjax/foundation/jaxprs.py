@@ -34,6 +34,19 @@ def _expanded(primitive, avals: tuple) -> ClosedJaxpr:
     return jax.make_jaxpr(expand)(*avals)
 
 
+def is_rounded_to_single(jaxpr: Jaxpr) -> bool:
+    """Whether a traced function computes anything in less than double precision on the way."""
+    for equation in jaxpr.eqns:
+        kinds = [jnp.finfo(one.aval.dtype) for one in equation.outvars if jnp.issubdtype(one.aval.dtype, jnp.inexact)]
+        parts = jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda one: isinstance(one, ClosedJaxpr | Jaxpr)
+        )
+        inner = [getattr(one, "jaxpr", one) for one in parts if isinstance(one, ClosedJaxpr | Jaxpr)]
+        if any(kind.eps > 1e-15 for kind in kinds) or any(map(is_rounded_to_single, inner)):
+            return True
+    return False
+
+
 def of_scan(params) -> tuple[int, int]:
     """How many operands all turns of a `scan` share, and how many numbers it carries from turn to turn."""
     if "num_consts" in params:

@@ -23,6 +23,10 @@ BY_NUMBER = {
     "exp2": "wp::pow((reals)(2.0), {})",
     "log1p": "wp::log1p({})",
     "expm1": "wp::expm1({})",
+    "asinh": "({0} < 0.0 ? (reals)(-1.0) : (reals)(1.0))"
+    " * wp::log1p(wp::abs({0}) + wp::abs({0}) / (1.0 / wp::abs({0}) + wp::sqrt(1.0 + 1.0 / ({0} * {0}))))",
+    "acosh": "wp::log1p({0} - 1.0 + wp::sqrt({0} - 1.0) * wp::sqrt({0} + 1.0))",
+    "atanh": "({0} < 0.0 ? (reals)(-0.5) : (reals)(0.5)) * wp::log1p(2.0 * wp::abs({0}) / (1.0 - wp::abs({0})))",
     "is_finite": "({0} - {0} == (reals)(0.0))",
     "not": "~{}",
     "max": "((({0} > {1}) | ({0} != {0})) ? {0} : {1})",

@@ -53,6 +53,10 @@ BY_NUMBER = {
     "sinh": "wp::sinh({})",
     "cosh": "wp::cosh({})",
     "tanh": "wp::tanh({})",
+    "asinh": "({0} < 0.0 ? -1.0 : 1.0)"
+    " * __builtin_log1p(wp::abs({0}) + wp::abs({0}) / (1.0 / wp::abs({0}) + wp::sqrt(1.0 + 1.0 / ({0} * {0}))))",
+    "acosh": "__builtin_log1p({0} - 1.0 + wp::sqrt({0} - 1.0) * wp::sqrt({0} + 1.0))",
+    "atanh": "({0} < 0.0 ? -0.5 : 0.5) * __builtin_log1p(2.0 * wp::abs({0}) / (1.0 - wp::abs({0})))",
     "logistic": "1.0 / (1.0 + wp::exp(-{}))",
     "floor": "wp::floor({})",
     "ceil": "wp::ceil({})",
@@ -75,13 +79,21 @@ BY_NUMBER = {
     "is_finite": "({0} - {0} == 0.0)",
 }
 # What leaves each number as it is.
-SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
+SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
 COMPARISONS = ("lt", "le", "lt_to", "le_to", "gt", "ge", "eq", "ne", "is_finite")
 
 
 def kind_of(aval) -> str:
-    """The type in C++ of numbers of an array."""
-    return "bool" if aval.dtype == jax.dtypes.float0 else TYPES[np.dtype(aval.dtype).name]
+    """The type in C++ of numbers of an array.
+
+    **Raises:** `NotImplementedError` where there is none, as of numbers in single precision.
+    """
+    if aval.dtype == jax.dtypes.float0:
+        return "bool"
+    name = np.dtype(aval.dtype).name
+    if name not in TYPES:
+        raise NotImplementedError(f"Numbers of type `{name}` have no C++ here; write the function without them.")
+    return TYPES[name]
 
 
 def text_of(entry) -> str:

@@ -280,6 +280,8 @@ class Writer:
                 if params["rounding_method"] == jax.lax.RoundingMethod.AWAY_FROM_ZERO
                 else "wp::rint({})"
             )
+        elif name == "not" and kind != "bool":
+            form = "~{}"
         elif name in BY_NUMBER:
             form = self.form_of(name, operands)
         else:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.digits import apart
+from ..foundation.jaxprs import is_rounded_to_single
 from ..foundation.precision import in_double_precision, is_known, real, state_for_pickle, state_from_pickle
 from ..foundation.smoothness import is_smooth
 from ..foundation.taylor import composed, taylor_coefficients
@@ -154,7 +155,7 @@ class AbstractFriction(eqx.Module):
         with jax.enable_x64(True):
             speed = jax.ShapeDtypeStruct((), np.dtype("float64"))
             try:
-                found = jax.eval_shape(self.__call__, speed)
+                traced, found = jax.make_jaxpr(lambda speed: self(speed), return_shape=True)(speed)
             except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
                 raise TypeError(
                     f"The friction law `{name}` must be a JAX function, but asks for a value while it is traced. "
@@ -166,9 +167,21 @@ class AbstractFriction(eqx.Module):
                 f"The friction law `{name}` must return one real number in double precision (float64 of shape ()), but returns "
                 f"{kind}. {more}"
             )
+        if is_rounded_to_single(traced.jaxpr):
+            raise TypeError(
+                f"The friction law `{name}` must compute in double precision, but rounds to single precision on the way: its "
+                f"steps could not be exact. Leave out `astype`, and make arrays by `np.asarray`. {more}"
+            )
 
     def __repr__(self) -> str:
         return as_call(type(self).__name__, vars(self))
+
+
+def numeric_fields(part: eqx.Module) -> dict[str, Array]:
+    """The fields of a law or a load that are its parameters, by name: others, such as strings and switches, are none."""
+    # `eqx.tree_at` may have put in a number of Python's.
+    known = {name: np.float64(value) if isinstance(value, float) else value for name, value in vars(part).items()}
+    return {name: value for name, value in known.items() if eqx.is_inexact_array(value)}
 
 
 def slope_of(law: AbstractFriction, slip_speed: Float[Array, "*contacts"]) -> Float[Array, "*contacts"]:
@@ -176,7 +189,7 @@ def slope_of(law: AbstractFriction, slip_speed: Float[Array, "*contacts"]) -> Fl
     return jax.jvp(law, (slip_speed,), (jnp.ones_like(slip_speed),))[1]
 
 
-@jax.jit
+@eqx.filter_jit
 def _sample(law: AbstractFriction, speeds: Float[Array, " k"]):
     def slope(speed):
         return slope_of(law, speed)

@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
-from .friction import AbstractFriction, NextTerm
+from .friction import AbstractFriction, NextTerm, numeric_fields
 
 
 class FrictionPerContact(AbstractFriction):
@@ -39,12 +38,7 @@ class FrictionPerContact(AbstractFriction):
     @property
     def parameters(self) -> dict[str, Array]:
         """The laws' parameters, each with its contact's number: `mu_0`, `mu_1`, …"""
-        return {
-            f"{name}_{i}": value
-            for i, law in enumerate(self.laws)
-            for name, value in vars(law).items()
-            if eqx.is_inexact_array(value)
-        }
+        return {f"{name}_{i}": value for i, law in enumerate(self.laws) for name, value in numeric_fields(law).items()}
 
     def replace(self, **changes) -> "FrictionPerContact":
         """With other values of some of the parameters."""

@@ -26,7 +26,7 @@ from ..foundation.precision import (
 from . import description
 from .contact_coordinates import in_contact_coordinates, transformation
 from .delassus_matrix import delassus, has_one_solution
-from .friction import AbstractFriction
+from .friction import AbstractFriction, numeric_fields
 from .friction_per_contact import FrictionPerContact
 from .load import AbstractLoad, ConstantLoad
 from .printing import as_call
@@ -87,10 +87,14 @@ class Scene(eqx.Module):
             raise ValueError(
                 f"Argument `friction` must be one law, or one for each of the {count} contacts, but holds {len(friction.laws)}."
             )
+        if isinstance(friction, FrictionPerContact) and count == 1:
+            (friction,) = friction.laws
         arguments.instance("load", load, AbstractLoad, "a load, such as Pulse(force=100.0, p=1.2)")
         _each_number("belt_speed", belt_speed, count)
         _each_number("restitution", restitution, count, minimum=0, maximum=1)
         arguments.one_of("impact_law", impact_law, IMPACT_LAWS)
+        _refuse_other_than_numbers("friction law", friction)
+        _refuse_other_than_numbers("load", load)
         # Numbers of a law or a load of the user's own may have come in single precision, or as Python's.
         friction = jax.tree.map(real_if_real, friction)
         own_load: AbstractLoad = jax.tree.map(real_if_real, load)
@@ -124,11 +128,7 @@ class Scene(eqx.Module):
         return self._parameters_of_parts()[part]
 
     def _parameters_of_parts(self) -> dict[str, dict[str, Array]]:
-        # Other fields of a user's own law, such as strings and switches, are no parameters.
-        friction, load = (
-            {name: value for name, value in vars(part).items() if eqx.is_inexact_array(value)}
-            for part in (self.friction, self.load)
-        )
+        friction, load = map(numeric_fields, (self.friction, self.load))
         if isinstance(self.friction, FrictionPerContact):
             friction = {**self.friction.parameters, **friction}
         own = {"belt_speed": self.belt_speed, "restitution": self.restitution}
@@ -215,6 +215,17 @@ def scene_in_contact_coordinates(scene: Scene) -> Scene:
     if structure.contacts_at_coordinates:
         return scene
     return dataclasses.replace(scene, structure=in_contact_coordinates(structure))
+
+
+def _refuse_other_than_numbers(what: str, part: eqx.Module) -> None:
+    """Numbers are parameters, which JAX transforms; all else must be fixed."""
+    for leaf in jax.tree.leaves(part):
+        if not isinstance(leaf, bool | int | float | complex) and not hasattr(leaf, "dtype"):
+            raise TypeError(
+                f"The {what} `{type(part).__name__}` must have numbers in its fields, but has a {type(leaf).__name__}. Fix "
+                "that field by `eqx.field(static=True)`; of a network, take numbers and functions apart by `eqx.partition(net, "
+                "eqx.is_array)`."
+            )
 
 
 def _each_number(name: str, value, count: int, **bounds) -> None:

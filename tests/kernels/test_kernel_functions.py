@@ -108,6 +108,9 @@ def by_numbers(args, instants):
             jnp.log(jnp.abs(x)),
             jnp.log1p(jnp.abs(x)),
             jnp.expm1(x),
+            jnp.arcsinh(x),
+            jnp.arccosh(jnp.maximum(jnp.abs(x), 1.0)),
+            jnp.arctanh(jnp.sin(x)),
             jnp.tanh(x),
             jnp.cbrt(x),
             2.0**x,
@@ -130,6 +133,7 @@ def by_numbers(args, instants):
             whole.astype(x.dtype),
             true.astype(jnp.int32),
             -whole,
+            ~whole,
             jnp.sign(whole),
             whole * whole,
         ],
@@ -278,6 +282,8 @@ def test_what_a_kernel_cannot_do_is_said():
         KernelFunction(lambda args, instants: (jnp.sum(instants), ()))((np.zeros(1),), np.zeros(3))
     with pytest.raises(NotImplementedError, match="primitive `digamma`"):
         KernelFunction(lambda args, instants: (jax.scipy.special.digamma(args[0]), ()))((np.ones(1),), np.zeros(3))
+    with pytest.raises(NotImplementedError, match="Numbers of type `float32`"):
+        KernelFunction(lambda args, instants: (args[0].astype(jnp.float32), ()))((np.ones(1),), np.zeros(3))
 
 
 def test_numpy_computes_what_jax_does():

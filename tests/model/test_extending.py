@@ -225,6 +225,40 @@ def test_what_proofs_need_of_a_law_and_cannot_have_is_said():
     assert "no finite bounds" in str(why_withheld(scene_with(bare(0.3, -0.1))))
 
 
+def test_a_law_with_a_word_for_a_parameter_is_refused():
+    class Named(Law):
+        name: str = "a law"
+
+    class Sampled(Half):
+        source: str = "a file"
+
+    with refused(TypeError, "`Named`", "a str", "static=True"):
+        scene_with(Named(0.3, -0.1))
+    with refused(TypeError, "load `Sampled`", "a str"):
+        fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), load=Sampled(1.0, 1.0))
+
+
+def test_a_law_that_rounds_to_single_precision_is_refused():
+    class Single(Law):
+        def __call__(self, slip_speed):
+            return super().__call__(
+                jax.lax.fori_loop(0, 2, lambda k, v: v.astype(np.float32).astype(v.dtype), slip_speed)
+            )
+
+    with refused(TypeError, "`Single`", "double precision", "astype"):
+        scene_with(Single(0.3, -0.1))
+
+
+def test_a_number_of_pythons_in_a_law_is_a_parameter_still():
+    """`eqx.tree_at` puts it there, past all constructors. Rejects forgetting it in what is saved."""
+    scene = fj.Scene(fj.belt_oscillator(), [fj.Coulomb(0.2, 0.3)])  # a list for one contact, too
+    own = lambda s: s.friction.mu_static  # noqa: E731
+    changed = eqx.tree_at(own, scene, 0.5)
+    assert set(changed.parameters) == set(scene.parameters)
+    run = fj.simulate(changed, 0.01, 0.01)
+    assert float(own(fj.Scene.from_dataset(run.to_dataset()))) == 0.5
+
+
 def test_a_law_that_jumps_is_refused():
     """Rejects friction that would change to and fro without end where slip is driven back over the jump."""
 
