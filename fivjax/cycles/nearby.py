@@ -20,7 +20,7 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
 from ..foundation.matrix_routines import eigenvalues
-from ..foundation.precision import in_double_precision, known_to_numpy, refusing_reverse_in_single_precision
+from ..foundation.precision import in_double_precision, is_known, known_to_numpy, refusing_reverse_in_single_precision
 from ..model.printing import as_call
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
@@ -92,6 +92,11 @@ def nearby_cycle(scene: Scene, cycle: LimitCycle, *, stages: int = 1, multiplier
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.instance("cycle", cycle, LimitCycle, "a limit cycle, such as `fivjax.limit_cycle(scene)`")
+    if not is_known(jax.tree.leaves(cycle)):
+        raise TypeError(
+            "Argument `cycle` must hold known numbers, but is traced. Close over it, "
+            "`jax.jit(lambda scene: fj.nearby_cycle(scene, cycle))`: the scene may be traced."
+        )
     arguments.whole_number("stages", stages, minimum=1)
     arguments.truth("multipliers", multipliers)
     if cycle.kind != "periodic":

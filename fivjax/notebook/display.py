@@ -54,6 +54,11 @@ def show(result, **options) -> Figure:
                 return draw(result, **options)
         if "displacement" in result and "status" in result:
             return _of_trajectory(Trajectory.from_dataset(result), **options)
+        raise ValueError(
+            f"Argument `result` is a dataset of fivjax's with {', '.join(map(str, result.data_vars))} over "
+            f"{', '.join(f'{name} ({size})' for name, size in result.sizes.items()) or 'no axis'}, of which there is no "
+            "picture. Read its numbers, or compute it for more values of an axis."
+        )
     raise TypeError(
         f"Argument `result` must be something that fivjax computed and can draw, but is {arguments.describe(result)}. "
         f"The modules `fj.plot`, `fj.plot.energy` and `fj.plot.linear` have pictures of parts."
@@ -106,7 +111,9 @@ def png(figure: Figure) -> bytes:
 
 
 def trajectory_summary(run: Trajectory) -> str:
-    """A trajectory as HTML: its picture, and a line with its duration, number of events and peak."""
+    """A trajectory as HTML: its picture, and a line with its duration, number of events and peak. A batch, as it prints."""
+    if np.ndim(run.t) != 1:
+        return f"<pre>{html.escape(repr(run))}</pre>"
     counts = {name: int(np.sum(np.asarray(run.status) == status)) for status, name in plot.STATUS_NAMES.items()}
     shares = ", ".join(f"{name} {count / np.size(run.status):.1%}" for name, count in counts.items() if count)
     along = np.asarray(run.slip_velocity) + np.asarray(run.scene.belt_speed)

@@ -99,6 +99,7 @@ def check_run(run) -> None:
             "of a dataset, maps, modes and the like are drawn by `fj.show(dataset)`."
         )
     arguments.instance("run", run, Trajectory, "a trajectory, such as `fj.simulate(scene, 2.0)` returns")
+    run.refuse_batch("A picture")
 
 
 def check_runs(runs) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -50,6 +51,10 @@ class Derivatives(eqx.Module):
     exist: bool = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> Array:
+        if name not in self.by_name:
+            raise KeyError(
+                f"There is no derivative by {name!r}, but by {', '.join(self.by_name)}; ask for it by `wrt`."
+            )
         return self.by_name[name]
 
     def __repr__(self) -> str:
@@ -169,7 +174,20 @@ def derivatives(
 @compiled
 def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
     def of(values):
-        value = functional(simulate(scene.replace(**values), t1, dt_save, method, y0=y0, derivatives=mode))
+        run = simulate(scene.replace(**values), t1, dt_save, method, y0=y0, derivatives=mode)
+        try:
+            value = functional(run)
+        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+            raise TypeError(
+                "Argument `functional` must be a JAX function, but asks for a value while it is traced. Use `jax.numpy` in "
+                "place of NumPy, and no `float` or `if`."
+            ) from error
+        leaves = jax.tree.leaves(value)
+        if not leaves or not all(jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in leaves):
+            raise TypeError(
+                f"Argument `functional` must return real numbers, but returns {value!r}: whole numbers, such as `status`, have "
+                "no derivatives."
+            )
         return value, value
 
     jacobian = jax.jacfwd if mode == "forward" else jax.jacrev

@@ -139,6 +139,7 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
 
 def _check(run) -> None:
     arguments.instance("run", run, Trajectory, "a trajectory, such as `simulate` returns")
+    run.refuse_batch("A table of cycles or events")
     refuse_vector_contacts(run.scene.structure, "A table of cycles or events")
     if run.energy is None:
         raise ValueError(

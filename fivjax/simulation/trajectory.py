@@ -84,20 +84,31 @@ class Trajectory(eqx.Module):
             f"  {self.meaning}"
         )
 
+    def refuse_batch(self, what: str) -> None:
+        """Refuse several trajectories in one, as `jax.vmap` makes them."""
+        if np.ndim(self.t) != 1:
+            raise ValueError(
+                f"{what} is that of one trajectory, but here is a batch of shape {np.shape(self.t)[:-1]}. Take one of them, "
+                "`jax.tree.map(lambda x: x[0], runs)`, or go through all by `jax.vmap`."
+            )
+
     @property
     def meaning(self) -> str:
         """How the trajectory ended, in a sentence."""
+        self.refuse_batch("`meaning`")
         return ENDING[Ending(int(self.outcome))]
 
     @property
     def slip_velocity(self) -> Float[Returned, "T *contacts"]:
         """Tangential velocity relative to the belt, in m/s; negative in steady sliding on a belt that moves forward."""
+        self.refuse_batch("`slip_velocity`")
         along = _at_contacts(self.velocity, self.scene.structure.tangential_directions)
         return along - known_to_numpy(self.scene.belt_speed)
 
     @property
     def gap(self) -> Float[Returned, "T *contacts"]:
         """Distance from the belt, in m."""
+        self.refuse_batch("`gap`")
         return _at_contacts(self.displacement, self.scene.structure.normal_directions)
 
     @classmethod
@@ -131,6 +142,7 @@ class Trajectory(eqx.Module):
         """The trajectory with names, units and the scene it came from."""
         import xarray as xr
 
+        self.refuse_batch("A dataset")
         along = ("t", "coordinate")
         each = ("t",) if np.ndim(self.status) == 1 else ("t", "contact")
         dataset = xr.Dataset(
@@ -176,9 +188,9 @@ def simulate(
     - `y0`: displacements and velocities at t = 0, as a pair of `(n,)` arrays or one of `(2n,)`, in m and m/s; the sliding
       equilibrium at rest unless given.
     - `energy`: whether to keep the energy ledger, `run.energy` (an `energy.Energy`). It costs time only if asked for.
-    - `derivatives`: the modes in which JAX may differentiate the run, "both", "forward", "reverse" or "none". One mode is
-      faster than both (`jax.grad` about ten times). "none", for runs that are only compiled or batched, is up to twice as fast
-      again, because derivatives need shorter steps. It has an effect only inside a JAX transformation.
+    - `derivatives`: the modes in which JAX may differentiate the run, "both", "forward", "reverse" or "none". Kernels have
+      both and need not be told. Where XLA follows a run inside a JAX transformation, one mode is faster than both (`jax.grad`
+      about ten times), and "none" up to twice as fast again, because derivatives need shorter steps.
     - `progress`: whether to show how far a run of more than a second is; unless given, in terminals and notebooks.
 
     **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion is no longer

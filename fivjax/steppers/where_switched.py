@@ -26,7 +26,7 @@ class WhereSwitched(AbstractStepper):
     each `dt` at most, and refuses a `dt` that is longer than that time.
 
     Steps should end at the jumps of the load: `simulate` and the maps see to that; in a plain `diffeqsolve` use
-    `diffrax.StepTo` or `diffrax.ClipStepSizeController`.
+    `diffrax.StepTo` with these instants among its own, or `diffrax.ClipStepSizeController` about a `PIDController`.
 
     **Raises:** `TypeError` for a solver that is not an explicit Runge–Kutta method, `ValueError` for a step that is
     not positive.

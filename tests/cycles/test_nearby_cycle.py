@@ -81,6 +81,8 @@ def test_what_cannot_be_is_refused(cycle):
         fj.nearby_cycle(SCENE, with_falling_friction(cycle))
     with pytest.raises(ValueError, match="Argument `stages` must be a whole number"):
         fj.nearby_cycle(SCENE, cycle, stages=0)
+    with pytest.raises(TypeError, match="Close over it"):
+        jax.jit(lambda cycle: fj.nearby_cycle(cycle.scene, cycle))(cycle)
     with pytest.raises(TypeError, match="need double precision around them"):
         jax.grad(lambda mu: fj.nearby_cycle(SCENE.replace(mu=mu), cycle).amplitude)(0.22)
 

@@ -285,6 +285,9 @@ def test_a_run_that_did_not_reach_its_end_has_no_derivatives():
     ("options", "error", "fragments"),
     [
         (dict(functional=3), TypeError, ["`functional`", "3"]),
+        (dict(functional=lambda run: float(run.t[-1])), TypeError, ["`functional`", "while it is traced", "`float`"]),
+        (dict(functional=lambda run: run.status[-1]), TypeError, ["`functional`", "real numbers", "`status`"]),
+        (dict(functional=lambda run: None), TypeError, ["`functional`", "real numbers", "None"]),
         (dict(wrt="mu"), TypeError, ["`wrt`", "'mu'"]),
         (dict(wrt=["muu"]), ValueError, ["`wrt`", "'muu'", "belt_speed"]),
         (dict(wrt=[]), ValueError, ["`wrt`", "none"]),

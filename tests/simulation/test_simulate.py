@@ -299,3 +299,17 @@ def test_an_undeformed_structure_at_rest_is_pressed_a_moment_later():
     expected = oracle.propagate(model, 0.05, y0=(np.zeros(3), np.zeros(3)))
     np.testing.assert_allclose(run.displacement[-1], expected.q[-1], atol=1e-9 * np.abs(expected.q[-1]).max())
     np.testing.assert_allclose(run.velocity[-1], expected.v[-1], atol=1e-9 * np.abs(expected.v[-1]).max())
+
+
+def test_a_batch_of_trajectories_is_refused_where_one_is_asked_for(paper_scene):
+    """As `jax.vmap` makes it. Rejects indexing its first axis as if it were time."""
+    with jax.enable_x64(True):
+        runs = jax.vmap(lambda p: fj.simulate(paper_scene.replace(p=p), 0.02, 0.01))(np.array([1.0, 1.2, 1.4]))
+    one = fj.simulate(paper_scene.replace(p=1.2), 0.02, 0.01)
+    asked = [lambda: runs.gap, lambda: runs.slip_velocity, lambda: runs.meaning, runs.to_dataset]
+    asked += [lambda: fj.plot.response(runs), lambda: fj.energy_per_cycle(runs)]
+    for ask in asked:
+        with pytest.raises(ValueError, match=r"here is a batch of shape \(3,\)"):
+            ask()
+    np.testing.assert_array_equal(jax.tree.map(lambda x: x[1], runs).gap, one.gap)
+    np.testing.assert_array_equal(np.asarray(jax.vmap(lambda run: run.displacement)(runs))[1], one.displacement)
