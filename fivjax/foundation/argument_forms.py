@@ -31,19 +31,19 @@ class Form(NamedTuple):
     def args(self, arrays: Sequence) -> Any:
         """The arguments with these arrays."""
         remaining = iter(arrays)
-        leaves = [next(remaining) if isinstance(leaf, Array) else leaf for leaf in self.leaves]
+        leaves = [next(remaining) if isinstance(leaf, ArrayForm) else leaf for leaf in self.leaves]
         return jax.tree.unflatten(self.structure, leaves)
 
     @property
-    def arrays(self) -> list["Array"]:
+    def arrays(self) -> list["ArrayForm"]:
         """Those of the arguments, in order."""
-        return [leaf for leaf in self.leaves if isinstance(leaf, Array)]
+        return [leaf for leaf in self.leaves if isinstance(leaf, ArrayForm)]
 
 
 _FORMS: dict[Form, Form] = {}
 
 
-class Array(NamedTuple):
+class ArrayForm(NamedTuple):
     """An array of a form."""
 
     shape: tuple[int, ...]
@@ -54,18 +54,18 @@ class Array(NamedTuple):
         return math.prod(self.shape)
 
 
-_NUMBER = Array((), "float64")
+_NUMBER = ArrayForm((), "float64")
 
 
-def _array(leaf) -> Array | None:
+def _array(leaf) -> ArrayForm | None:
     """What is told of an array; of what is none, nothing."""
     # In the order in which they are most frequent: a call looks at some hundred of them.
     if isinstance(leaf, np.ndarray):
-        return Array(leaf.shape, _name_of(leaf.dtype))
+        return ArrayForm(leaf.shape, _name_of(leaf.dtype))
     if isinstance(leaf, float):
         return _NUMBER
     if isinstance(leaf, jax.Array | np.generic):
-        return Array(leaf.shape, _name_of(np.dtype(leaf.dtype)))
+        return ArrayForm(leaf.shape, _name_of(np.dtype(leaf.dtype)))
     return None
 
 

@@ -159,16 +159,16 @@ class KernelFunction:
 
     @functools.cached_property
     def _derived_by_xla(self):
-        return compiled(lambda form, common, each, dots, instants: self._with_slopes(form, common, dots, instants))
+        return compiled(lambda form, common, each, dots, instants: self._along_each(form, common, dots, instants))
 
     @functools.cached_property
     def _derived_of_each_by_xla(self):
         def run(form: Form, common, each, dots, instants):
-            return jax.vmap(lambda own: self._with_slopes(form, [*common, *own], dots, instants))(each)
+            return jax.vmap(lambda own: self._along_each(form, [*common, *own], dots, instants))(each)
 
         return compiled(run)
 
-    def _with_slopes(self, form: Form, arrays, dots, instants):
+    def _along_each(self, form: Form, arrays, dots, instants):
         real = list(map(is_real, arrays))
 
         def of(dots):

@@ -18,7 +18,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from ..foundation.argument_forms import Array, Form
+from ..foundation.argument_forms import ArrayForm, Form
 from ..foundation.precision import own_settings
 from .code import Slot, form_with_slopes, jvp_along
 from .kernel import GIVEN, Kernel, kernel_of, width_for
@@ -171,19 +171,19 @@ def _second_derivative(primals, tangents, *, kernel: _Hashed):
     # What does not move takes no width.
     moves = [not isinstance(tangent, ad.Zero) and is_real(tangent) for tangent in of_arrays]
     dotted = list(compress(of_arrays, moves))
-    _, slopes = jvp_along(lambda arrays: _with_slopes(kernel, dots, instants, *arrays), arrays, moves, dotted)
+    _, slopes = jvp_along(lambda arrays: _by_kernel_with_slopes(kernel, dots, instants, *arrays), arrays, moves, dotted)
     return kernel_p.bind(*primals, kernel=kernel), slopes
 
 
 ad.primitive_jvps[kernel_p] = _second_derivative
 
 
-def _with_slopes(kernel: _Hashed, dots, instants, *arrays) -> list:
+def _by_kernel_with_slopes(kernel: _Hashed, dots, instants, *arrays) -> list:
     """What a kernel finds, so that its tangents have derivatives: by the kernel of a function that gives both."""
     own = kernel.kernel
     if _batch_of(kernel, arrays):
         axes = None, 0 if instants.ndim > 1 else None, *(0 for _ in arrays)
-        return jax.vmap(functools.partial(_with_slopes, kernel), axes)(dots, instants, *arrays)
+        return jax.vmap(functools.partial(_by_kernel_with_slopes, kernel), axes)(dots, instants, *arrays)
     wide = list(compress(own.form.arrays, own.wide))
     function, form = own.function.with_slopes, form_with_slopes(own.form, own.wide)
     ends, rows = jax.vmap(lambda dot: values(function, form, (*arrays, *_arrays(wide, dot)), instants), 1, 1)(dots)
@@ -198,7 +198,7 @@ def _with_slopes(kernel: _Hashed, dots, instants, *arrays) -> list:
     return [part if part.shape == shape else jnp.zeros(shape) for part, shape in parts]
 
 
-def _arrays(like: Sequence[Array], numbers) -> list:
+def _arrays(like: Sequence[ArrayForm], numbers) -> list:
     """The arrays of which these are the numbers, one after the other."""
     ends = np.cumsum([array.size for array in like])[:-1]
     return [part.reshape(array.shape) for array, part in zip(like, jnp.split(numbers, ends), strict=True)]
