@@ -64,7 +64,8 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
     zero), found by Newton's method with the exact derivative of $P$ through every contact event.
 
     **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene), or a
-    pair of a state `(2n,)` in m and m/s and a status. From such a start, an unstable cycle may be found, too. Without `start`,
+    pair of a state `(2n,)` in m and m/s and a status, of which what the status sets to zero, such as the gap, is not looked
+    at. From such a start, an unstable cycle may be found, too. Without `start`,
     motions are released from rest under several loads and from sticking; where none comes to a cycle, with larger kicks to both
     sides, and then from a cycle at a lower belt speed. Of the stable cycles and tori that they come to, the one with the
     largest amplitude is returned: they are found and proved as those of a map are.

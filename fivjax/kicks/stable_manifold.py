@@ -75,8 +75,9 @@ def saddle_passed(scene: Scene, path: Crossings) -> Saddle | None:
         if len(y) <= count + 1:
             continue
         back = np.linalg.norm(y[count:] - y[:-count], axis=-1) / sizes[:-count]
-        # Returns without events do not count: sliding that fades slowly repeats well, too.
-        back = np.where(path.events[count : path.count] > path.events[: path.count - count], back, np.inf)
+        if scene.friction.constant:
+            # Returns without events do not count: sliding that fades slowly repeats well, too, and has no saddle.
+            back = np.where(path.events[count : path.count] > path.events[: path.count - count], back, np.inf)
         lowest = (back[1:-1] <= back[:-2]) & (back[1:-1] <= back[2:])
         places = np.flatnonzero(lowest) + 1
         tried += [(back[place] * (1 + 0.5 * (count - 1)), count, int(place)) for place in places]

@@ -160,3 +160,21 @@ def test_a_saddle_is_found_that_motions_come_to_in_other_modes():
     low, p, high = found["p_crit"].values
     assert p == pytest.approx(1.57153522489, abs=1e-11)
     assert found["d_p_crit"].sel(parameter="mu").values[1] == pytest.approx((high - low) / (2 * step), rel=1e-6)
+
+
+def test_a_saddle_may_slide_all_the_time():
+    """Under falling friction, below a subcritical Hopf point. Rejects asking a saddle for events."""
+    friction, load = fj.ExponentialDecay(0.23, 0.1276, 1.76), fj.Pulse(100.0, p=1.8, duration=0.031)
+    scene = fj.Scene(fj.belt_oscillator(c1=3.5, c2=4.2), friction, belt_speed=1.12, load=load)
+    assert {phase.status for phase in fj.saddle_cycle(scene).word} == {fj.Status.SLIDE}
+    step = 1e-5
+    speeds = np.array([1.12 - step, 1.12, 1.12 + step])
+    found = fj.critical_perturbation(
+        scene, belt_speed=speeds, p_range=(1.75, 1.9), p_step=0.05, derivatives=True, progress=False
+    )
+    assert set(found["kind"].values) == {"manifold"}
+    low, p, high = found["p_crit"].values
+    slope = found["d_p_crit"].sel(parameter="belt_speed").values[1]
+    assert slope == pytest.approx((high - low) / (2 * step), rel=1e-5)
+    verdicts = fj.bistability_map(scene, p=[p - 1e-7, p + 1e-7], progress=False)["verdict"].values
+    assert verdicts.tolist() == [0, 1]
