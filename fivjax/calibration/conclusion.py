@@ -9,11 +9,11 @@ from ..foundation.compiling import compiled
 from .covariance import covariance_of
 from .cycle_misfit import CycleMisfit
 from .goodness_of_fit import ROUNDING, ResidualTests, exceeds_noise, residual_tests
-from .misfit import OFFSET_UNIT
 from .parameters import FreeParameters
 from .problem import Problem
 from .result import FITTED, Calibration, FitOutcome
 from .search import LEAST_KEPT, FitSearch
+from .waveform_misfit import KickMisfit
 
 # A cycle whose disturbances grow by more than this factor in a period is unstable.
 UNSTABLE = 1.001
@@ -43,9 +43,10 @@ def concluded(search: FitSearch, identifiable_within: float) -> Calibration:
         deviations = deviations * np.sqrt(max(left.misfit, ROUNDING))
     offsets: list = [None] * len(problem.misfits)
     for k in search.moved:
-        place = problem.places[k].start
+        place, mine = problem.places[k].start, problem.misfits[k]
+        assert isinstance(mine, KickMisfit)
         offset = float(problem.own(best.x)[k][0])
-        offsets[k] = (offset, float(OFFSET_UNIT * deviations[place]))
+        offsets[k] = (offset, float(mine.offset_unit * deviations[place]))
     return Calibration(
         scene=problem.at(u),
         names=problem.parameters.names,

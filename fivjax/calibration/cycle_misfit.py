@@ -16,7 +16,7 @@ from ..io.recordings import Channel, Recording
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from .folding import folded
-from .misfit import OFFSET_UNIT, AbstractMisfit, Compared, sliding_frequencies
+from .misfit import AbstractMisfit, Compared, sliding_frequencies
 from .noise import LEAST_NOISE
 from .samples import Sampled
 from .shooting import Cycle, OnePeriod, around, guess_limit_cycle, unclosed, waveform
@@ -80,7 +80,8 @@ class CycleMisfit(AbstractMisfit):
         # Where in its period the scene is at each of the measured phases.
         shifted = jnp.angle(self.measured[0, 0]) - jnp.angle(lines[0, 0])
         turns = self.phases + self.times * (1 / cycle.period - self.frequency)
-        turns = turns + shifted / (2 * jnp.pi) + OFFSET_UNIT * shift[0] / cycle.period
+        # What is unknown of it: in sixteenths of a period.
+        turns = turns + shifted / (2 * jnp.pi) + shift[0] / 16
         nothing = jnp.zeros_like(self.means), jnp.zeros(self.means.shape, bool)
         model, touched = jax.lax.cond(
             share < 1, lambda: nothing, lambda: self._waveform(scene, cycle, after, lines, turns)

@@ -27,8 +27,6 @@ from ..model.scene import Scene
 
 # The residual of a motion that is not finite: large enough never to be chosen, small enough to be squared.
 HOPELESS = 1e12
-# The unit of a kick's time offset, in s.
-OFFSET_UNIT = 1e-3
 
 
 class Compared(NamedTuple):

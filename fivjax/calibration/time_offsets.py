@@ -6,7 +6,6 @@ from jaxtyping import Array, Float
 
 from ..foundation.compiling import compiled
 from .initial_guesses import state_matrices
-from .misfit import OFFSET_UNIT
 from .problem import Problem
 from .samples import Sampled
 from .waveform_misfit import KickMisfit
@@ -41,7 +40,7 @@ def best_offsets(
             model = over[shift::OFFSETS_PER_BLOCK][: len(means)]
             cost[i, :, shift] = np.cumsum(np.sum(((means - model) / sigma) ** 2, axis=1))[ends]
     best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=-1)
-    return np.minimum(step * best, high - low) / OFFSET_UNIT
+    return np.minimum(step * best, high - low) / float(mine.offset_unit)
 
 
 def periods_aside(
@@ -51,11 +50,13 @@ def periods_aside(
 
     A vibration is similar to itself a period later, so these may be better minima.
     """
-    place = problem.places[k].start
-    period = _period(problem, x[: problem.size]) / OFFSET_UNIT
+    place, mine = problem.places[k].start, problem.misfits[k]
+    assert isinstance(mine, KickMisfit)
+    unit = float(mine.offset_unit)
+    period = _period(problem, x[: problem.size]) / unit
     shifted = np.tile(x, (len(WHOLE_PERIODS), 1))
     shifted[:, place] += period * np.array(WHOLE_PERIODS)
-    offsets = bounds[0] + OFFSET_UNIT * shifted[:, place]
+    offsets = bounds[0] + unit * shifted[:, place]
     return list(shifted[(bounds[0] <= offsets) & (offsets <= bounds[1])]), 0.5 * period
 
 

@@ -18,7 +18,7 @@ from ..model.sliding import free_in_sliding
 from ..simulation.start import start_state
 from ..steppers.base import AbstractStepper
 from .characteristic import characteristic_residual
-from .misfit import OFFSET_UNIT, AbstractMisfit, Compared, finite, window
+from .misfit import AbstractMisfit, Compared, finite, window
 from .mode_poles import strongest_poles
 from .noise import noise_of_means
 from .responses import Response, response_of
@@ -81,12 +81,17 @@ class KickMisfit(AbstractWaveformMisfit):
     unknowns: int = eqx.field(static=True)
     projected: int = eqx.field(static=True, default=0)
 
+    @property
+    def offset_unit(self) -> Float[Array, ""]:
+        """The unit of an unknown time offset: a block, in s."""
+        return self.edges[1] - self.edges[0]
+
     def own(self, x):
         """The time offset (s) and the state at time 0, None for steady sliding."""
         if self.free:
             assert self.y0 is not None and self.scale is not None
             return self.reference, self.y0.at[jnp.array(self.free)].set(self.scale * x)
-        return (self.reference + OFFSET_UNIT * x[0] if self.unknowns else self.reference), self.y0
+        return (self.reference + self.offset_unit * x[0] if self.unknowns else self.reference), self.y0
 
     def compared(self, scene, own, share):
         model, touched = self.predicted(scene, own)

@@ -53,6 +53,21 @@ def test_decaying_response_from_thirty_per_cent_off(decay, decay_fit):
     np.testing.assert_allclose(decay_fit.residuals[0].std(axis=0), expected, rtol=0.1)
 
 
+def test_a_fit_does_not_depend_on_the_unit_of_time(decay, decay_fit):
+    """The same recording of an oscillator that is slower by a factor of 10⁵. Rejects offsets in milliseconds."""
+    scene, data = decay
+    slower, time = {}, 1e5
+    for name, value in scene.parameters.items():
+        scale = {"c": 1 / time, "k": 1 / time**2, "f": 1 / time**2, "b": 1 / time, "d": time}.get(name[0], 1.0)
+        slower[name] = float(value) * scale
+    slow = recording(data.values / time**2, data.regime, rate=data.rate / time, offset=(0.0, 0.5 * time))
+    fit = fj.calibrate(off(scene.replace(**slower), FREE[3], 0), slow, FREE[3], starts=4, progress=False)
+    for name, scale in {"mu": 1.0, "c1": time, "k1": time**2}.items():
+        assert scale * fit.values[name] == pytest.approx(decay_fit.values[name], rel=1e-9)
+        assert scale * fit.uncertainty[name] == pytest.approx(decay_fit.uncertainty[name], rel=1e-6)
+    np.testing.assert_allclose(np.array(fit.offsets[0]) / time, decay_fit.offsets[0], rtol=1e-6)
+
+
 OF_FIRST = ["mu_0", "c1", "k1"]
 
 
