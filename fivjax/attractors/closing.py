@@ -139,9 +139,11 @@ def _newton_steps(maps: ReturnMaps, jacobian, gap) -> Float[np.ndarray, "m 2n"]:
     """NaN where there is none."""
     matrices = np.eye(gap.shape[1]) - jacobian
     if len(maps.structure.contacts) > 1:
-        # Uncoupled oscillators may be shifted against each other in time, so the step is not unique: the shortest is taken.
-        steps = [np.linalg.lstsq(*one, rcond=1e-9)[0] for one in zip(matrices, gap, strict=True)]
-        return np.array(steps).reshape(gap.shape)
+        # Uncoupled oscillators may be shifted against each other in time, so the step is not unique: the shortest is taken, in
+        # energy.
+        scaled = maps.weights[:, None] * matrices / maps.weights, maps.weights * gap
+        steps = [np.linalg.lstsq(*one, rcond=1e-9)[0] for one in zip(*scaled, strict=True)]
+        return np.array(steps).reshape(gap.shape) / maps.weights
     with np.errstate(all="ignore"):
         solvable = np.abs(np.linalg.det(matrices)) > 0
     matrices[~solvable] = np.eye(gap.shape[1])

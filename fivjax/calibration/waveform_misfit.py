@@ -151,8 +151,11 @@ def _inside(matrix, sampled: Sampled) -> Float[Array, "m m"]:
 
 def _closest_start(scene: Scene, mine: KickMisfit) -> Float[np.ndarray, " u"]:
     waves, means, equilibrium = map(np.asarray, _weighted_waves(scene, mine))
+    # Displacements and velocities differ by a factor of the frequency.
+    sizes = np.linalg.norm(waves, axis=0)
+    sizes[sizes == 0] = 1.0
     # By NumPy: columns may depend on each other.
-    return equilibrium + np.linalg.lstsq(waves, means)[0][: len(mine.free)]
+    return equilibrium + (np.linalg.lstsq(waves / sizes, means)[0] / sizes)[: len(mine.free)]
 
 
 @compiled

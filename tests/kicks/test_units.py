@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from tests.helpers.several_contacts import coupled
 
 # kg, m and s become so many units: tonnes and millimetres; a system of ever higher, one of ever lower frequencies.
 UNITS = {"tonne-mm": (1e-3, 1e3, 1.0), "fast": (1e-18, 1e-6, 1e-9), "slow": (1e12, 1e-6, 1e5)}
@@ -42,3 +43,23 @@ def test_the_smallest_perturbations_are_the_same(units):
     np.testing.assert_allclose(
         np.array([state_there.size, state_there.certified]) / root_energy, [state.size, state.certified], rtol=1e-7
     )
+
+
+@pytest.mark.slow
+def test_a_cycle_of_two_contacts_closes_at_any_frequency():
+    """Next to it, by Newton's method. Rejects steps that are cut off by the ratio of displacements to velocities."""
+    structure, time = coupled(2), 1e-9
+
+    def scene_in(mass, length, time):
+        units = (mass, mass / time, mass / time**2, mass * length / time**2)
+        parts = [np.asarray(part) * unit for part, unit in zip(structure.matrices, units, strict=True)]
+        return fj.Scene(
+            fj.Structure(*parts, contacts=structure.contacts), fj.Coulomb(0.24), length / time, fj.ConstantLoad(100.0)
+        )
+
+    cycle = fj.limit_cycle(scene_in(1.0, 1.0, 1.0))
+    start = np.asarray(cycle.state) + np.concatenate([np.full(6, 1e-6), np.full(6, 1e-4)])
+    start = np.concatenate([start[:6] * 1e-6, start[6:] * 1e-6 / time])
+    found = fj.limit_cycle(scene_in(1e-18, 1e-6, time), start=(start, cycle.contact.status))
+    assert found.period / time == pytest.approx(cycle.period, rel=1e-12)
+    assert found.amplitude * time / 1e-6 == pytest.approx(cycle.amplitude, rel=1e-10)
