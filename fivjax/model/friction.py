@@ -5,7 +5,7 @@ worked out in `contact`.
 """
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -180,7 +180,9 @@ class AbstractFriction(eqx.Module):
 def numeric_fields(part: eqx.Module) -> dict[str, Array]:
     """The fields of a law or a load that are its parameters, by name: others, such as strings and switches, are none."""
     # `eqx.tree_at` may have put in a number of Python's.
-    known = {name: np.float64(value) if isinstance(value, float) else value for name, value in vars(part).items()}
+    known: dict[str, Any] = {
+        name: np.float64(value) if isinstance(value, float) else value for name, value in vars(part).items()
+    }
     return {name: value for name, value in known.items() if eqx.is_inexact_array(value)}
 
 
