@@ -4,6 +4,7 @@ A law is a callable of the slip speed |v_rel| ≥ 0 (m/s). The direction of slip
 worked out in `contact`.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -178,10 +179,13 @@ class AbstractFriction(eqx.Module):
 
 
 def numeric_fields(part: eqx.Module) -> dict[str, Array]:
-    """The fields of a law or a load that are its parameters, by name: others, such as strings and switches, are none."""
+    """The fields of a law or a load that are its parameters, by name: whole numbers, say, and fixed fields are none."""
+    fixed = [field.name for field in dataclasses.fields(part) if field.metadata.get("static", False)]
     # `eqx.tree_at` may have put in a number of Python's.
     known: dict[str, Any] = {
-        name: np.float64(value) if isinstance(value, float) else value for name, value in vars(part).items()
+        name: np.float64(value) if isinstance(value, float) else value
+        for name, value in vars(part).items()
+        if name not in fixed
     }
     return {name: value for name, value in known.items() if eqx.is_inexact_array(value)}
 
