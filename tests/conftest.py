@@ -140,12 +140,14 @@ def paper_scene() -> fj.Scene:
 
 @pytest.fixture
 def compilations() -> list[str]:
-    """Has an entry for each program that is compiled from now on. JAX's listeners stay for as long as the process lives."""
+    """Has the name of each program that is compiled from now on. JAX's listeners stay for as long as the process lives."""
     # Not above: JAX reads where to keep what is compiled when it is imported.
     import jax
 
     found: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(
-        lambda event, duration, **about: found.append(event) if event.endswith("backend_compile_duration") else None
+        lambda event, duration, **about: (
+            found.append(about.get("fun_name", "")) if event.endswith("backend_compile_duration") else None
+        )
     )
     return found

@@ -15,7 +15,7 @@ _known_dependence: weakref.WeakKeyDictionary[Jaxpr, dict[tuple[bool, ...], list[
 
 def within(params) -> ClosedJaxpr | None:
     """The traced function that an equation calls once, if it calls one."""
-    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call"):
         part = params.get(name)
         # Newer versions have one class for both.
         if isinstance(part, ClosedJaxpr):

@@ -11,12 +11,13 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float, Num
 
 
 def register() -> None:
     """Make LAPACK known to JAX in this process, as it does by itself where it lowers a call of it."""
-    jax.jit(jnp.linalg.eigvals).lower(jnp.eye(2))
+    jax.jit(jnp.linalg.eigvals).lower(np.eye(2))
 
 
 def eigenvalues(matrix: Num[Array, "n n"]) -> Complex[Array, " n"]:

@@ -7,6 +7,7 @@ processes (`numpy_plans`), because to trace the function takes longer still than
 import contextlib
 import functools
 import json
+import math
 import sys
 import threading
 from collections import Counter, OrderedDict
@@ -18,7 +19,7 @@ import numpy as np
 
 from .argument_forms import Form
 from .compiling import compiled, transformed
-from .kept_programs import kept_value
+from .kept_programs import kept, kept_value
 from .numpy_plans import NoSuchCase, NumpyPlan, numpy_plan_of
 from .plain_trees import NotPlain, from_text, structure_to_text
 from .precision import own_settings
@@ -30,12 +31,18 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R]:
+def by_numpy(function: Callable[P, R], *, always: bool = False, up_to: float = math.inf) -> Callable[P, R]:
     """`compiled`, but the first calls with known values are computed by NumPy; results of all such calls are arrays of NumPy.
 
-    With `always`, so are later calls: where it matters that all are rounded alike.
+    With `always`, so are later calls: where it matters that all are rounded alike. Calls with an array of more than `up_to`
+    entries are not: where NumPy's time grows so fast with their number that a single call takes longer than to compile.
     """
-    otherwise = compiled(function)
+
+    @functools.cache
+    def otherwise() -> Callable[P, R]:
+        # Once it can be told whether the function is found by its name.
+        return kept(function) if _is_named(call) else compiled(function)
+
     plans: dict = {}
     lock = threading.RLock()
     calls: Counter = Counter()
@@ -45,17 +52,17 @@ def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if transformed((args, kwargs)):
-            return otherwise(*args, **kwargs)
+            return otherwise()(*args, **kwargs)
         form, arrays = Form.of((args, kwargs))
         key = form, *(np.asarray(array).tobytes() for array in arrays)
         if (found := latest.get(key)) is None:
             calls[form] += 1
-            if calls[form] > REPAID and not always:
-                return jax.tree.map(_numbers, otherwise(*args, **kwargs))
+            if (calls[form] > REPAID and not always) or any(array.size > up_to for array in form.arrays):
+                return jax.tree.map(_numbers, otherwise()(*args, **kwargs))
             try:
                 latest[key] = found = computed(form, arrays)
             except NoSuchCase:
-                return jax.tree.map(_numbers, otherwise(*args, **kwargs))
+                return jax.tree.map(_numbers, otherwise()(*args, **kwargs))
             with contextlib.suppress(KeyError):  # where threads leave out the same
                 while len(latest) > (FEW if always else LATEST):
                     latest.popitem(last=False)

@@ -37,16 +37,21 @@ PLAIN: dict[str, Callable] = {
     "or": np.bitwise_or,
     "not": np.invert,
     "is_finite": np.isfinite,
+    "conj": np.conj,
+    "real": np.real,
+    "imag": np.imag,
+    "complex": lambda real, imaginary: _complex(real, imaginary),
     "stop_gradient": np.asarray,
     "copy": np.asarray,
     "copy_p": np.asarray,
 }
 # By name, of operands and then the primitive's parameters; None where NumPy has no such case.
 WITH_PARAMETERS: dict[str, Callable] = {
-    "div": lambda a, b, p: a / b if np.issubdtype(np.result_type(a), np.inexact) else None,
+    "div": lambda a, b, p: a / b if np.issubdtype(np.result_type(a), np.inexact) else _quotient(a, b),
+    "rem": lambda a, b, p: np.fmod(a, b) if np.issubdtype(np.result_type(a), np.inexact) or np.all(b) else None,
     "integer_pow": lambda a, p: a ** p["y"] if p["y"] >= 0 else 1.0 / a ** -p["y"],
     "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
-    "convert_element_type": lambda a, p: np.asarray(a).astype(p["new_dtype"]),
+    "convert_element_type": lambda a, p: _converted(np.asarray(a), np.dtype(p["new_dtype"])),
     "bitcast_convert_type": lambda a, p: (
         np.asarray(a).view(p["new_dtype"]) if np.dtype(p["new_dtype"]).itemsize == a.dtype.itemsize else None
     ),
@@ -65,6 +70,7 @@ WITH_PARAMETERS: dict[str, Callable] = {
     "reduce_min": lambda a, p: np.min(a, axis=tuple(p["axes"])) if a.size else None,
     "reduce_and": lambda a, p: np.all(a, axis=tuple(p["axes"])),
     "reduce_or": lambda a, p: np.any(a, axis=tuple(p["axes"])),
+    "cumsum": lambda a, p: _summed_up(a, p["axis"], p["reverse"]),
     "argmax": lambda a, p: np.argmax(a, axis=p["axes"][0]),
     "argmin": lambda a, p: np.argmin(a, axis=p["axes"][0]),
     "select_n": lambda which, *cases: _selected(which, cases[:-1]),
@@ -77,6 +83,8 @@ WITH_PARAMETERS: dict[str, Callable] = {
 SEVERAL: dict[str, Callable] = {
     "split": lambda a, p: np.split(a, np.cumsum(p["sizes"])[:-1], p["axis"]),
     "unstack": lambda a, p: list(np.moveaxis(a, p["axis"], 0)),
+    "sort": lambda *a: _sorted(a[:-1], a[-1]["dimension"], a[-1]["num_keys"]),
+    "eig": lambda a, p: _eigen(a, p["compute_left_eigenvectors"], p["compute_right_eigenvectors"]),
 }
 # Those of them for which it depends on shapes and types whether there is such a case. (For `gather` it depends on indices.)
 SOME_CASES = ("div", "bitcast_convert_type", "pad", "reduce_max", "reduce_min")
@@ -234,6 +242,50 @@ def _selected(which, cases):
     if np.ndim(which) == 0:
         return cases[int(which)]
     return np.choose(np.asarray(which, int), cases) if len(cases) > 2 else np.where(which, cases[1], cases[0])
+
+
+def _converted(array, kind):
+    # NumPy warns where an imaginary part is left out.
+    return (array.real if np.iscomplexobj(array) and kind.kind != "c" else array).astype(kind)
+
+
+def _quotient(a, b):
+    """Of whole numbers, towards zero; of none by zero."""
+    return (a - np.fmod(a, b)) // b if np.all(b) else None
+
+
+def _complex(real, imaginary):
+    # By parts: i times infinity would have a real part, too, which is no number.
+    found = np.empty(np.shape(real), np.result_type(real, 1j))
+    found.real, found.imag = real, imaginary
+    return found
+
+
+def _summed_up(array, along: int, from_the_end: bool):
+    turned = np.flip(array, along) if from_the_end else array
+    found = np.cumsum(turned, along, array.dtype)
+    return np.flip(found, along) if from_the_end else found
+
+
+def _sorted(operands, along: int, keys: int):
+    order = np.lexsort(operands[:keys][::-1], along)
+    return [np.take_along_axis(own, order, along) for own in operands]
+
+
+def _eigen(matrices, left: bool, right: bool):
+    """By the routine of LAPACK that JAX calls."""
+    from scipy import linalg
+
+    kept = 1 + left + right
+    shape, size = matrices.shape[:-2], matrices.shape[-1]
+    found = [np.full((*shape, *(size,) * (1 + (k > 0))), np.nan, complex) for k in range(kept)]
+    for at in np.ndindex(*shape):
+        # Of what is no number nothing is.
+        if np.all(np.isfinite(matrices[at])):
+            parts = linalg.eig(matrices[at], left=left, right=right, check_finite=False)
+            for own, part in zip(found, parts if kept > 1 else [parts], strict=True):
+                own[at] = part
+    return found
 
 
 def _product(left, right, numbers):

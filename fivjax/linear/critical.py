@@ -1,5 +1,7 @@
 """Where steady sliding loses its stability: critical friction and critical slope of the friction law."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,8 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..foundation import arguments
-from ..foundation.compiling import compiled
-from ..foundation.kept_programs import kept
+from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
@@ -17,7 +18,7 @@ from ..model.sliding import contact_coordinates, free_in_sliding
 from ..model.structure import Structure
 from .crossings import first_limit
 from .feedback import friction_loop, slope_loop
-from .gradients import with_own_gradient
+from .gradients import by_numpy_if_small, with_own_gradient
 from .outcomes import CODES, WHY, Mechanism, StabilityOutcome
 from .several_contacts import critical_friction_of_several, first_limit_of_several, one_contact
 from .system import as_scene, check_direction
@@ -84,9 +85,9 @@ def _checked(structure: Structure, direction) -> Structure:
     return own
 
 
-def _several(structure: Structure, direction) -> tuple[Structure, Float[Array, " c"]]:
-    # One compiled program serves contacts of any directions.
-    return matrices_only(structure), jnp.full(len(structure.contacts), float(direction))
+def _along(own: Structure, direction) -> Float[np.ndarray, "*c"]:
+    """The belt's direction, at each contact where there are several: one program serves contacts of any directions."""
+    return np.full(() if one_contact(own) else len(own.contacts), float(direction))
 
 
 def _is_a_limit(value):
@@ -94,21 +95,16 @@ def _is_a_limit(value):
     return jnp.isfinite(value) & (value != 0)
 
 
+@functools.partial(with_own_gradient, exists=_is_a_limit)
 def _friction_limit(structure, direction):
-    return first_limit(friction_loop(structure, direction)[0]).gain
+    """That of a structure as it was given, so that its parameters' way into the matrices is differentiated with it."""
+    loop, _ = friction_loop(matrices_only(in_contact_coordinates(structure)), direction)
+    return first_limit(loop).gain
 
 
-def _by_its_parameters(limit):
-    """The limit of a structure as it was given, so that its parameters' way into the matrices is differentiated with it."""
-    return lambda structure, direction: limit(matrices_only(in_contact_coordinates(structure)), direction)
-
-
-_LIMITS = _friction_limit, critical_friction_of_several
-_critical_friction = kept(with_own_gradient(_friction_limit, _is_a_limit))
-_critical_friction_of_several = compiled(with_own_gradient(critical_friction_of_several, _is_a_limit))
-_traced_limit, _traced_limit_of_several = (
-    compiled(with_own_gradient(_by_its_parameters(limit), _is_a_limit)) for limit in _LIMITS
-)
+@functools.partial(with_own_gradient, exists=_is_a_limit)
+def _friction_limit_of_several(structure, direction):
+    return critical_friction_of_several(matrices_only(in_contact_coordinates(structure)), direction)
 
 
 @returning_numpy
@@ -138,21 +134,19 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
         0.2282253477
     """
     own = _checked(structure, direction)
-    traced, along = not all(map(is_known, jax.tree.leaves(structure))), jnp.asarray(float(direction))
-    if one_contact(own):
-        return _traced_limit(structure, along) if traced else _critical_friction(matrices_only(own), along)
-    matrices, along = _several(own, direction)
-    return _traced_limit_of_several(structure, along) if traced else _critical_friction_of_several(matrices, along)
+    given = matrices_only(own) if all(map(is_known, jax.tree.leaves(structure))) else structure
+    limit = _friction_limit if one_contact(own) else _friction_limit_of_several
+    return limit(given, _along(own, direction))
 
 
-@compiled
+@by_numpy_if_small
 def _stability_limit(structure, direction):
     loop, scale = friction_loop(structure, direction)
     limit = first_limit(loop)
     return StabilityLimit(mu=limit.gain, frequency=limit.omega * scale / (2 * jnp.pi), code=limit.code)
 
 
-@compiled
+@by_numpy_if_small
 def _stability_limit_of_several(structure, direction):
     mu, omega, code = first_limit_of_several(structure, direction)
     return StabilityLimit(mu=mu, frequency=omega / (2 * jnp.pi), code=code)
@@ -174,19 +168,16 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
         (67.92, 'flutter')
     """
     own = _checked(structure, direction)
-    if not one_contact(own):
-        return _stability_limit_of_several(*_several(own, direction))
-    return _stability_limit(matrices_only(own), jnp.asarray(float(direction)))
+    limit = _stability_limit if one_contact(own) else _stability_limit_of_several
+    return limit(matrices_only(own), _along(own, direction))
 
 
+@functools.partial(with_own_gradient, exists=_is_a_limit)
 def _slope_limit(scene):
     mu = scene.friction(jnp.abs(scene.belt_speed))
     loop, _ = slope_loop(scene.structure, mu, jnp.sign(scene.belt_speed))
     _, normal_force = steady_sliding(scene, scene.load.final)
     return -first_limit(loop).gain / normal_force
-
-
-_critical_slope = compiled(with_own_gradient(_slope_limit, _is_a_limit))
 
 
 @returning_numpy
@@ -209,7 +200,7 @@ def critical_slope(scene: Scene) -> Float[Array, ""]:
     """
     scene = as_scene(_a_scene(scene), None, 1)
     refuse_several_contacts(scene.structure, "`critical_slope`", "`growth_rate` takes several.")
-    return _critical_slope(scene)
+    return _slope_limit(scene)
 
 
 @returning_numpy
@@ -223,6 +214,11 @@ def friction_slope(scene: Scene) -> Float[Array, ""]:
         -0.0389
     """
     scene = as_scene(_a_scene(scene), None, 1)
+    return _slopes_of_friction(scene)
+
+
+@by_numpy
+def _slopes_of_friction(scene):
     contacts, speed = len(scene.structure.contacts), jnp.abs(scene.belt_speed)
     return slope_of(scene.friction, speed if contacts == 1 else jnp.broadcast_to(speed, (contacts,)))
 

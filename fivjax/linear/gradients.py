@@ -1,13 +1,20 @@
 """Growth rates and derivatives that are safe from rounding at double eigenvalues and from single precision."""
 
+import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..foundation.compiling import transformed
 from ..foundation.matrix_routines import eigenvectors
+from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision
+
+# Time grows with the fourth power of the number of coordinates: for twenty NumPy takes a tenth of a second, and XLA seconds to
+# compile.
+by_numpy_if_small = functools.partial(by_numpy, up_to=20**2)
 
 
 def in_natural_units(matrix: Float[Array, "n n"], scale) -> Float[Array, "n n"]:
@@ -40,19 +47,41 @@ def significant_growth(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
 def with_own_gradient(function: Callable, exists: Callable = jnp.isfinite) -> Callable:
     """A scalar function whose gradient is computed together with its value, in double precision.
 
-    The derivative is NaN where `exists(value)` is false.
+    Known values are computed by NumPy, also where a caller's `jax.grad` asks for the derivative. It is NaN where
+    `exists(value)` is false.
 
     Without double precision turned on, JAX runs the backward pass after the public function has returned, in single precision,
     and fails. Here only a sum of products with the gradient is left to the backward pass.
     """
-    own = jax.custom_jvp(function)
 
-    @own.defjvp
+    @functools.wraps(function)
+    def call(*args):
+        return differentiated(*args) if transformed(args) else call.value(*args)
+
+    def value(*args):
+        return function(*args)
+
+    def value_and_gradient(*args):
+        return jax.value_and_grad(function, argnums=tuple(range(len(args))))(*args)
+
+    for part in (value, value_and_gradient):
+        # By this name what is traced of it is kept for later processes.
+        part.__module__, part.__qualname__ = function.__module__, f"{function.__qualname__}.{part.__name__}"
+        setattr(call, part.__name__, by_numpy_if_small(part))
+    differentiated = jax.custom_jvp(call.value)
+
+    @differentiated.defjvp
     @in_double_precision
     def rule(primals, tangents):
-        value, gradients = jax.value_and_grad(function, argnums=tuple(range(len(primals))))(*primals)
-        flag = jnp.where(exists(value), 1.0, jnp.nan)
-        products = jax.tree.map(lambda g, t: jnp.sum(flag * g * t), gradients, tangents)
-        return value, sum(jax.tree.leaves(products))
+        found, gradients = call.value_and_gradient(*primals)
+        return jnp.asarray(found), _along(exists, found, gradients, tangents)
 
-    return own
+    return call
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _along(exists, value, gradients, tangents):
+    """The derivative along some tangents."""
+    flag = jnp.where(exists(value), 1.0, jnp.nan)
+    products = jax.tree.map(lambda gradient, tangent: jnp.sum(flag * gradient * tangent), gradients, tangents)
+    return sum(jax.tree.leaves(products))

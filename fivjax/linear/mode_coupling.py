@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation import arguments
-from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import refuse_several_contacts
@@ -14,6 +13,7 @@ from ..model.structure import Structure
 from .critical import matrices_only
 from .crossings import first_limit
 from .feedback import friction_loop
+from .gradients import by_numpy_if_small
 from .outcomes import COALESCENCE, StabilityOutcome
 from .system import check_direction
 
@@ -39,7 +39,7 @@ class Coalescence(eqx.Module):
         return f"two modes {meet} at μ = {self.mu:.8g}, {self.frequency:.6g} Hz, growth rate {self.growth_rate:.4g} 1/s"
 
 
-@kept
+@by_numpy_if_small
 def _coalescence(structure, direction):
     undamped = eqx.tree_at(lambda s: s.damping, structure, jnp.zeros_like(structure.damping))
     loop, scale = friction_loop(undamped, direction)

@@ -1,7 +1,7 @@
 r"""Quadratic pencils $λ^2 M + λ C + K$ of any real matrices, and those of sliding structures with any number of contacts."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -87,22 +87,21 @@ def sliding_pencil(system: Structure | SparseStructure, mu, *, direction=1) -> P
     **Raises:** `ValueError` for negative or infinite friction, or a number of values that is neither one nor that of the
     contacts.
     """
-    right, left, friction_part = _bases(system)
-    friction = signed_friction(system, mu, direction)
-    left = left - friction_part(friction)
-    return Pencil(*(left.T @ (matrix @ right) for matrix in _sparse_matrices(system)))
+    bases = _Bases.of(system)
+    left = bases.left(signed_friction(system, mu, direction))
+    return Pencil(*(left.T @ (matrix @ bases.right) for matrix in _sparse_matrices(system)))
 
 
 def friction_derivative(system: Structure | SparseStructure, mu, *, direction=1) -> Pencil:
-    """The derivative of the sliding pencil by a friction coefficient that all contacts share."""
-    right, _, friction_part = _bases(system)
-    change = friction_part(signed_friction(system, np.ones_like(np.asarray(mu, float)), direction))
-    return Pencil(*(-change.T @ (matrix @ right) for matrix in _sparse_matrices(system)))
+    """The derivative of the sliding pencil at `mu`, by what is added to the friction coefficients of all contacts."""
+    bases, signs = _Bases.of(system), signed_friction(system, np.ones_like(np.asarray(mu, float)), direction)
+    slope = bases.left_slope(signed_friction(system, mu, direction), signs)
+    return Pencil(*(slope.T @ (matrix @ bases.right) for matrix in _sparse_matrices(system)))
 
 
 def sliding_motions(system: Structure | SparseStructure) -> "sparse.csc_array":
     """Z: displacements of the structure for each coordinate of the sliding pencil."""
-    return _bases(system)[0]
+    return _Bases.of(system).right
 
 
 def signed_friction(system: Structure | SparseStructure, mu, direction) -> np.ndarray:
@@ -132,40 +131,61 @@ def _sparse_matrices(system):
     return [sparse.csr_array(np.asarray(matrix)) for matrix in system.matrices[:3]]
 
 
-def _bases(system: Structure | SparseStructure):
-    """Z, Y without friction, and the part that friction takes from Y, as a function of σμ."""
-    from scipy import sparse
-    from scipy.linalg import null_space
+class _Bases(NamedTuple):
+    """Z of the sliding motions, and what Y, onto which they are projected, is made of: Y = Z - dual A, A = G Wₜᵀ Z.
 
-    normal, tangential = system.normal_directions, system.tangential_directions
-    if not normal.shape[1]:
-        raise ValueError("The structure has no contacts. Give `contacts` to `read_structure`, or use `cea.Pencil`.")
-    # Only coordinates in which a normal direction has an entry are replaced; all others stay, so the matrices stay sparse.
-    touched = np.flatnonzero(np.any(normal != 0, axis=1))
-    others = np.setdiff1d(np.arange(system.size), touched)
-    kernel = null_space(normal[touched].T)
-    if kernel.shape[1] != len(touched) - normal.shape[1]:
-        raise ValueError(
-            "The normal directions of the contacts must be linearly independent, but some follow from others."
-        )
-    inner = sparse.coo_array(kernel)
-    right = sparse.csc_array(
-        (
-            np.append(inner.data, np.ones(len(others))),
+    By B' Y = 0, G = (1 + diag(σμ) Wₜᵀ dual)⁻¹ diag(σμ).
+    """
+
+    right: "sparse.csc_array"  # Z
+    dual: "sparse.csc_array"  # Wₙᵀ dual = 1, and Zᵀ dual = 0
+    against: "sparse.csc_array"  # Wₜᵀ Z
+    mixed: np.ndarray  # Wₜᵀ dual: not zero where a tangential direction is not at right angles to the normal ones
+
+    @classmethod
+    def of(cls, system: Structure | SparseStructure) -> "_Bases":
+        from scipy import sparse
+        from scipy.linalg import null_space
+
+        normal, tangential = system.normal_directions, system.tangential_directions
+        if not normal.shape[1]:
+            raise ValueError("The structure has no contacts. Give `contacts` to `read_structure`, or use `cea.Pencil`.")
+        # Only coordinates in which a normal direction has an entry are replaced; all others stay, so the matrices stay sparse.
+        touched = np.flatnonzero(np.any(normal != 0, axis=1))
+        others = np.setdiff1d(np.arange(system.size), touched)
+        kernel = null_space(normal[touched].T)
+        if kernel.shape[1] != len(touched) - normal.shape[1]:
+            raise ValueError(
+                "The normal directions of the contacts must be linearly independent, but some follow from others."
+            )
+        inner = sparse.coo_array(kernel)
+        right = sparse.csc_array(
             (
-                np.append(touched[inner.row], others),
-                np.append(inner.col, kernel.shape[1] + np.arange(len(others))),
+                np.append(inner.data, np.ones(len(others))),
+                (
+                    np.append(touched[inner.row], others),
+                    np.append(inner.col, kernel.shape[1] + np.arange(len(others))),
+                ),
             ),
-        ),
-        shape=(system.size, kernel.shape[1] + len(others)),
-    )
-    dual = sparse.csc_array(np.linalg.pinv(normal).T)  # Wₙᵀ dual = 1, and Zᵀ dual = 0
-    against = sparse.csc_array(tangential.T) @ right
-    mixed = tangential.T @ dual.toarray()
+            shape=(system.size, kernel.shape[1] + len(others)),
+        )
+        dual = sparse.csc_array(np.linalg.pinv(normal).T)
+        against = sparse.csc_array(sparse.csc_array(tangential.T) @ right)
+        return cls(right, dual, against, tangential.T @ dual.toarray())
 
-    def friction_part(friction: np.ndarray) -> sparse.csc_array:
-        # B' Y = 0 with Y = Z - dual A: (1 + diag(σμ) Wₜᵀ dual) A = diag(σμ) Wₜᵀ Z.
-        inner = np.linalg.solve(np.eye(len(friction)) + friction[:, None] * mixed, np.diag(friction))
-        return (dual @ sparse.csc_array(inner) @ against).tocsc()
+    def left(self, friction: np.ndarray) -> "sparse.csc_array":
+        """Y at these σμ of the contacts."""
+        return (self.right - self._of_contacts(self._shares(friction, friction))).tocsc()
 
-    return right, right, friction_part
+    def left_slope(self, friction: np.ndarray, change: np.ndarray) -> "sparse.csc_array":
+        """The change of Y with σμ: that of G is (1 + diag(σμ) Wₜᵀ dual)⁻¹ diag(change) (1 - Wₜᵀ dual G)."""
+        seen = np.eye(len(friction)) - self.mixed @ self._shares(friction, friction)
+        return -self._of_contacts(self._shares(friction, change) @ seen)
+
+    def _shares(self, friction: np.ndarray, factors: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(np.eye(len(friction)) + friction[:, None] * self.mixed, np.diag(factors))
+
+    def _of_contacts(self, shares: np.ndarray) -> "sparse.csc_array":
+        from scipy import sparse
+
+        return (self.dual @ sparse.csc_array(shares) @ self.against).tocsc()

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..foundation.quantities import QUANTITIES
 from ..io.datasets import labelled
 from ..model.structure import Structure
 from .critical import critical_friction, stability_limit
+from .gradients import by_numpy_if_small
 from .outcomes import Mechanism, StabilityOutcome
 from .system import as_scene
 
@@ -104,7 +104,7 @@ def sensitivity(structure: Structure, *, direction: int = 1) -> Sensitivity:
     return Sensitivity(labelled(dataset, scene, analysis="sensitivity of mu_crit", mechanism=limit.mechanism.value))
 
 
-@kept
+@by_numpy_if_small
 def _slopes(structure: Structure, direction):
     """dμ_crit/dp and dC/dp by name of parameter."""
     values, build = _named_parameters(structure)

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..foundation import arguments, matrix_routines
-from ..foundation.compiling import compiled
 from ..foundation.kept_programs import kept
+from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import is_known, real, returning_numpy
 from ..model.scene import Scene, sliding_equilibrium
 from ..model.structure import Structure
@@ -45,7 +45,9 @@ def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> 
     return _matrix(_check(system, mu, direction))
 
 
-_matrix = compiled(lambda scene: sliding_motion(scene)[0])
+@by_numpy
+def _matrix(scene):
+    return sliding_motion(scene)[0]
 
 
 def _check(system, mu, direction) -> Scene:
@@ -93,7 +95,7 @@ def _check_frictions(mu) -> None:
             raise ValueError(f"Argument `mu` must be non-negative and finite, but holds {bad[0]:g}.")
 
 
-@kept
+@by_numpy
 def _eigenvalues(scene):
     found = matrix_routines.eigenvalues(sliding_motion(scene)[0])
     return found[jnp.lexsort((found.imag, found.real, jnp.abs(found.imag)))]
@@ -104,9 +106,9 @@ def _eigenvalues_over(structure, mu, direction):
     return jax.lax.map(lambda value: _eigenvalues(as_scene(structure, value, direction)), mu, batch_size=POINTS_AT_ONCE)
 
 
-_growth_rate = compiled(
-    with_own_gradient(lambda scene: jnp.max(matrix_routines.eigenvalues(sliding_motion(scene)[0]).real))
-)
+@with_own_gradient
+def _growth_rate(scene):
+    return jnp.max(matrix_routines.eigenvalues(sliding_motion(scene)[0]).real)
 
 
 @returning_numpy

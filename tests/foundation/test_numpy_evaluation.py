@@ -12,6 +12,7 @@ import pytest
 from fivjax.foundation import numpy_evaluation
 from fivjax.foundation.blocks import in_threads
 from fivjax.foundation.linear_solve import solve
+from fivjax.foundation.matrix_routines import eigenvalues
 from fivjax.foundation.numpy_evaluation import by_numpy
 from fivjax.foundation.numpy_plans import NumpyPlan, numpy_plan_of
 from fivjax.section.about_sliding import sliding_state
@@ -84,6 +85,29 @@ def test_a_plan_is_text_and_gives_the_same():
             for own, other in zip(found, expected, strict=True):
                 assert own.dtype == other.dtype
                 np.testing.assert_allclose(own, other, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: jax.lax.linalg.eig(x[:4, :4]),
+        lambda x: jax.vmap(eigenvalues)(jnp.stack([x[:3, :3], x[1:4, 1:4], x[:3, :3] * jnp.nan])),
+        lambda x: jax.lax.sort((x > 0, x, -x), dimension=0, num_keys=2),
+        lambda x: jax.lax.sort(jnp.where(x > 1, jnp.nan, x), dimension=1),
+        lambda x: [jnp.cumsum(x, 1), jax.lax.cumsum(x, 0, reverse=True), jnp.cumsum(x > 0)],
+        lambda x: [jax.lax.div(k := (9 * x).astype(int), 3 + 0 * k), jax.lax.rem(k, -4 + 0 * k), jnp.fmod(x, 0.3)],
+        lambda x: [z := jax.lax.complex(x, 1 / (x - x[0, 0])), z.conj(), z.imag, z.real, z / (1 + 2j)],
+    ],
+)
+def test_all_of_it_is_numpy_s_and_agrees_with_jax(function):
+    x = np.random.default_rng(8).normal(size=(4, 5))
+    with jax.enable_x64(True):
+        plan = json.loads(json.dumps(numpy_plan_of(jax.make_jaxpr(function)(x))))
+        with np.errstate(divide="ignore"):
+            found, expected = NumpyPlan(plan)([x]), jax.tree.leaves(jax.jit(function)(x))
+        for own, other in zip(found, expected, strict=True):
+            assert own.dtype == other.dtype
+            np.testing.assert_allclose(own, other, rtol=1e-13, atol=1e-14)
 
 
 def test_what_numpy_does_not_have_is_left_to_jax():

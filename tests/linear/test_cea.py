@@ -739,6 +739,22 @@ def test_damping_in_proportion_to_mass_has_the_derivatives_of_flutter(damping):
     assert float(slopes[1]) + float(slopes[2]) == pytest.approx(exact[2], rel=1e-8)
 
 
+def test_the_first_derivative_of_a_limit_waits_for_no_compiler(compilations):
+    """NumPy computes it, because XLA takes seconds to compile it; within a caller's program the two are the same."""
+
+    def limit(k1):
+        return fj.cea.critical_friction(fj.belt_oscillator(k1=k1))
+
+    with jax.enable_x64(True):
+        jax.grad(lambda k1: fj.belt_oscillator(k1=k1).stiffness[0, 0])(1e5)
+        before = len(compilations)
+        slope = jax.grad(limit)(1.1e5)
+        later = compilations[before:]
+        assert later and not [name for name in later if "value" in name or "limit" in name]
+        assert float(slope) == pytest.approx(float(jax.jit(jax.grad(limit))(1.1e5)), rel=1e-9)
+        assert any("limit" in name for name in compilations[before:])
+
+
 def test_a_function_of_parameters_is_differentiated_in_a_program_in_single_precision():
     def matrices(k, c):
         stiffness = jnp.array([[k, -3e3, 0.0], [-3e3, 1e4, -2e3], [0.0, -2e3, 9e3]])

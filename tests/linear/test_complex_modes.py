@@ -196,6 +196,22 @@ def test_derivatives_of_eigenvalues_against_differences(big):
     np.testing.assert_allclose(slopes, ((moved[0].eigenvalues - moved[1].eigenvalues) / 2e-6)[[3, 5]], rtol=1e-6)
 
 
+@pytest.mark.parametrize("mu", [0.3, [0.2, 0.5]])
+def test_the_pencil_s_derivative_by_friction_where_tangents_are_not_at_right_angles_to_normals(mu):
+    """How much friction a normal force gives then depends on friction, too; and of two contacts on that of the other."""
+    contacts = [
+        fj.ContactPoint([1.0, 0, 0, 0, 0], [0.5, 0, 1.0, 0, 0.2]),
+        fj.ContactPoint([0, 1.0, 0.3, 0, 0], [0, 0.4, 0, 1.0, 0]),
+    ]
+    stiffness, mass = np.diag([3.0, 2.0, 4.0, 5.0, 1.0]) + 0.3, np.diag([1.0, 2.0, 1.0, 1.0, 0.5])
+    structure = fj.Structure(mass, 0.01 * stiffness, stiffness, [0, 0, -1.0, -1.0, 0], contacts=contacts)
+    slope, step = fj.cea.friction_derivative(structure, mu, direction=[1, -1]), 1e-5
+    ends = [fj.cea.sliding_pencil(structure, np.add(mu, sign * step), direction=[1, -1]) for sign in (1, -1)]
+    for name in ("mass", "damping", "stiffness"):
+        difference = (getattr(ends[0], name) - getattr(ends[1], name)) / (2 * step)
+        np.testing.assert_allclose(getattr(slope, name).toarray(), difference.toarray(), atol=1e-8)
+
+
 def test_equal_eigenvalues_have_no_derivative_of_their_own():
     """At a coalescence the left and right eigenvectors are at right angles: NaN, and no finite garbage."""
     pencil = fj.cea.Pencil(np.eye(2), np.zeros((2, 2)), np.array([[1.0, 1.0], [0.0, 1.0]]))
