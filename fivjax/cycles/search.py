@@ -19,6 +19,8 @@ from ..foundation import arguments
 from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
+from ..linear.several_contacts import free_closed_coordinates
+from ..linear.spectrum import linearisation
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
 from ..model.sliding import contact_coordinates
@@ -30,13 +32,16 @@ from .cycle import LimitCycle, limit_cycle_of, under_final_load
 from .own_coordinates import in_own_coordinates
 from .torus import limit_cycle_of_torus
 
-# Motions are released from rest under these multiples of the final load, and with the tangential velocities of steady sliding
-# moved by these multiples of the belt's: at 1 the contacts stick. The further ones only where the first meet nothing.
-LOADS, SPEEDS = (0.0, 1.2, 1.5, 2.0, 3.0, 4.5, 6.0), (1.0,)
+# Motions are released from rest under these multiples of the final load, with the tangential velocities of steady sliding moved
+# by these multiples of the belt's (at 1 the contacts stick), and along modes of steady sliding, by which the fastest contact
+# would reach these multiples of its belt's speed. The further ones only where the first meet nothing.
+LOADS, SPEEDS, ALONG_MODES = (0.0, 1.2, 1.5, 2.0, 3.0, 4.5, 6.0), (1.0,), (1.1, 1.6, 3.0, 8.0)
 FURTHER_LOADS, FURTHER_SPEEDS = (0.5, 10.0, 20.0), (-4.0, -2.0, -1.0, 2.0, 4.0)
 # Where these meet nothing either: shares of the belt speed at which a cycle is sought that is then followed to the whole of
 # it, in so many steps.
 SLOWER, STEPS = (0.7, 0.4), 6
+# The most modes along which motions are released: those that grow fastest, or decay most slowly.
+MOST_MODES = 8
 # The largest number of points of the section in one period that is tried for a periodic motion near a start.
 MOST_CROSSINGS = 12
 
@@ -65,10 +70,10 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
 
     **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene), or a
     pair of a state `(2n,)` in m and m/s and a status, of which what the status sets to zero, such as the gap, is not looked
-    at. From such a start, an unstable cycle may be found, too. Without `start`,
-    motions are released from rest under several loads and from sticking; where none comes to a cycle, with larger kicks to both
-    sides, and then from a cycle at a lower belt speed. Of the stable cycles and tori that they come to, the one with the
-    largest amplitude is returned: they are found and proved as those of a map are.
+    at. From such a start, an unstable cycle may be found, too. Without `start`, motions are released from rest under several
+    loads, from sticking, and along the modes of steady sliding (eight at most); where none comes to a cycle, with larger kicks
+    to both sides, and then from a cycle at a lower belt speed. Of the stable cycles and tori that they come to, the one with
+    the largest amplitude is returned: they are found and proved as those of a map are.
     `progress`: whether to show what it is doing; unless given, in terminals and notebooks.
 
     **Returns:** a `LimitCycle`.
@@ -92,9 +97,9 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
             raise NoLimitCycle(
                 f"No limit cycle was met: not by {len(LOADS + FURTHER_LOADS)} motions released from rest under 0 to "
                 f"{max(FURTHER_LOADS):g} times the final load, nor by {len(SPEEDS + FURTHER_SPEEDS)} from sticking and from "
-                f"{min(FURTHER_SPEEDS):g} to {max(FURTHER_SPEEDS):g} times the belt's speed, nor from a cycle at {slower} of "
-                f"the belt speed.{family if met.in_families else ''}"
-                f"{irregular if met.left else ''} "
+                f"{min(FURTHER_SPEEDS):g} to {max(FURTHER_SPEEDS):g} times the belt's speed, nor along modes of sliding up to "
+                f"{max(ALONG_MODES):g} times that speed, nor from a cycle at {slower} of the belt speed."
+                f"{family if met.in_families else ''}{irregular if met.left else ''} "
                 f"If you know a motion near one, give it as `start`."
             )
         return met.cycles[0]
@@ -159,7 +164,8 @@ def _met(scene: Scene, starts: Sequence = ()) -> Met:
     yet, and then a cycle that is followed from a lower belt speed.
     """
     maps = ReturnMaps.of(scene)
-    met = attractors_met(maps, scene, _released(scene, LOADS, SPEEDS, starts))
+    released = np.concatenate([_released(scene, LOADS, SPEEDS, starts), _along_modes(scene, maps)])
+    met = attractors_met(maps, scene, released)
     if not met.cycles:
         further = attractors_met(maps, scene, _released(scene, FURTHER_LOADS, FURTHER_SPEEDS))
         met = Met(further.cycles, met.in_families + further.in_families, met.left + further.left)
@@ -244,6 +250,23 @@ def _released(
     moved[:, scene.structure.size + np.atleast_1d(tangential)] = np.outer(speeds, np.atleast_1d(scene.belt_speed))
     given = [_state_of(scene, start) - rest for start in starts]
     return np.concatenate([np.asarray(_released_states(scene, np.asarray(loads))), moved, *np.array(given)[:, None]])
+
+
+def _along_modes(scene: Scene, maps: ReturnMaps) -> Float[np.ndarray, "m 2n"]:
+    """Deviations along each mode of steady sliding, of several sizes and at two instants of its period."""
+    values, shapes = np.linalg.eig(np.asarray(linearisation(under_final_load(scene))))
+    free, n = free_closed_coordinates(scene.structure), scene.structure.size
+    full = np.zeros((len(values), 2 * n), complex)
+    full[:, np.concatenate([free, n + free])] = shapes.T
+    along = n + np.atleast_1d(maps.tangential)
+    sizes, speeds = np.abs(maps.weights * full), full[:, along] / np.atleast_1d(scene.belt_speed)
+    # Of a mode that hardly moves a contact, motions would be without measure.
+    vibrating = (values.imag > 0) & (np.max(sizes[:, along], axis=1) > 1e-3 * np.max(sizes, axis=1))
+    slowest = [k for k in np.argsort(-values.real) if vibrating[k]][:MOST_MODES]
+    fastest = np.argmax(np.abs(speeds), axis=1)
+    units = full[slowest] / np.take_along_axis(speeds, fastest[:, None], axis=1)[slowest]
+    factors = np.array([*ALONG_MODES, *(-1j * size for size in ALONG_MODES)])
+    return (factors[:, None, None] * units).real.reshape(-1, 2 * n)
 
 
 def _state_of(scene: Scene, start, name: str = "start") -> np.ndarray:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 # Number of durations at which the bound is evaluated, and of those tried as starts of the search.
 GRID, STARTS = 4096, 24
 # Steps of a search; and the derivative of p_crit that counts as zero, relative to p - 1 per duration.
-MOST_STEPS, LEVEL = 24, 1e-9
+MOST_STEPS, LEVEL = 100, 1e-9
 
 
 class SmallestKick(NamedTuple):
@@ -239,25 +239,29 @@ def _descended(scene: Scene, p: float, duration: float, shortest: float, longest
             saddle = saddle_of(found.saddle, weights_of(scene.structure))
         return found
 
-    here = critical(duration, p)
-    step = (longest - shortest) / (4 * STARTS)
+    here, curvature = critical(duration, p), 0.0
+    reach = (longest - shortest) / (4 * STARTS)
     for _ in range(MOST_STEPS):
         if here is None or abs(here.d_p["duration"]) * duration < LEVEL * (here.p - 1):
             break
         slope = here.d_p["duration"]
-        d = float(np.clip(duration - np.sign(slope) * step, max(shortest, 1e-6 * longest), longest))
+        # To where the last two slopes say that p_crit is least, as far as they reach.
+        lowest = abs(slope) / curvature if curvature > 0 else np.inf
+        wanted = duration - np.sign(slope) * min(reach, lowest)
+        d = float(np.clip(wanted, max(shortest, 1e-6 * longest), longest))
+        change = d - duration
         # A tangent may lead to no kick at all; near a guess that is too far off nothing is found, and the step is shortened.
-        guess = max(here.p + slope * (d - duration), 1 + 0.25 * (here.p - 1))
-        following = critical(d, guess) if d != duration else None
-        if following is None or following.p >= here.p:
-            step *= 0.25
-            if step < 1e-9 * longest:
+        guess = max(here.p + (slope + 0.5 * curvature * change) * change, 1 + 0.25 * (here.p - 1))
+        following = critical(d, guess) if change else None
+        if following is not None:
+            curvature = (following.d_p["duration"] - slope) / change
+        # Next to the minimum values differ by rounding alone.
+        if following is None or following.p > here.p + 1e-13:
+            reach = 0.25 * abs(change)
+            if reach < 1e-9 * longest:
                 break
             continue
-        turned = following.d_p["duration"] * slope < 0
-        # Beyond the minimum: the slopes on both sides tell where it is.
-        share = abs(slope) / (abs(slope) + abs(following.d_p["duration"]))
-        step = abs(d - duration) * (1 - share if turned else 1.0)
+        reach = 2 * abs(change)
         duration, here = d, following
     return (p, duration) if here is None else (here.p, duration)
 

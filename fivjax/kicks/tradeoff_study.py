@@ -237,16 +237,17 @@ def _state_error(state: np.ndarray, reference: np.ndarray, n: int) -> float:
 def _cost(scene: Scene, method: AbstractStepper, t1: float, trajectories: int) -> float:
     """Wall time (s) of `trajectories` trajectories that differ a little in their kick, or are copies if there is no kick."""
     if isinstance(scene.load, Pulse):
-        kicks = np.asarray(scene.load.p) * np.linspace(0.99, 1.01, trajectories)
-        run = jax.jit(jax.vmap(lambda p: _run(scene, method, t1, p)[0][-1]))
+        each = np.asarray(scene.load.p) * np.linspace(0.99, 1.01, trajectories)
+        one = lambda scene, p: _run(scene, method, t1, p)[0][-1]  # noqa: E731
     else:
-        kicks = np.ones(trajectories)
-        run = jax.jit(
-            jax.vmap(
-                lambda one: _run(jax.tree.map(lambda leaf: leaf * one.astype(leaf.dtype), scene), method, t1)[0][-1]
-            )
-        )
-    return _timed(lambda: run(kicks))
+        each = np.ones(trajectories)
+
+        def one(scene, factor):
+            return _run(jax.tree.map(lambda leaf: leaf * factor.astype(leaf.dtype), scene), method, t1)[0][-1]
+
+    # The scene is an argument: of a known one mechanics would be computed in double precision.
+    run = jax.jit(jax.vmap(one, (None, 0)))
+    return _timed(lambda: run(scene, each))
 
 
 def _timed(function: Callable) -> float:

@@ -417,3 +417,35 @@ def test_a_step_that_leads_where_there_is_no_return_is_halved(patient):
     # One step too far, and none from where nothing returns.
     assert abs(asked[1][0] - 2) > 0.9 and asked[2][0] == pytest.approx(0.5 * (2.5 + asked[1][0]))
     assert [len(x) for x in asked[:2]] == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("masses", "stiffness", "damping", "force", "friction", "belt_speed", "restitution"),
+    [
+        pytest.param(
+            [1.183, 1.192, 1.081, 1.362],
+            [[2.398, 0.166, 0.335, 0.155], [0.166, 1.924, -0.268, 0.234], [0.335, -0.268, 3.24, 0.582], [0.155, 0.234, 0.582, 2.792]],
+            0.007939, 0.71, fj.Coulomb(0.632, 0.821), 0.215, 0.0, id="a cycle where sliding is stable",
+        ),
+        pytest.param(
+            [1.026, 0.835, 0.591, 0.506],
+            [[3.07, 0.34, 0.292, -0.034], [0.34, 1.822, -0.258, 0.206], [0.292, -0.258, 2.085, 0.165], [-0.034, 0.206, 0.165, 2.615]],
+            0.001812, 0.988, fj.Coulomb(0.718, 1.437), 0.26, 0.4, id="two cycles",
+        ),
+    ],
+)  # fmt: skip
+def test_cycles_that_many_initial_states_come_to_are_found(
+    masses, stiffness, damping, force, friction, belt_speed, restitution
+):
+    """Neither was met by kicks of the load and from sticking alone, which move all modes at once."""
+    mass, stiffness = np.diag(masses), np.array(stiffness)
+    structure = fj.Structure(
+        mass, damping * (mass + stiffness), stiffness, [0, -force, 0, 0], contacts=[fj.ContactPoint(0, 1)]
+    )
+    scene = fj.Scene(structure, friction, belt_speed, fj.ConstantLoad(1.0), restitution=restitution)
+    grid = fj.basins(scene, dq0=np.linspace(-1.0, 1.0, 9), q2=np.linspace(-1.0, 1.0, 9), progress=False)
+    often = grid["attractor_amplitude"].values[grid["share"].values > 0.05]
+    assert often.size
+    amplitudes = np.array([cycle.amplitude for cycle in fj.limit_cycles(scene, progress=False)])
+    for amplitude in often:
+        assert np.min(np.abs(amplitudes / amplitude - 1)) < 1e-4
