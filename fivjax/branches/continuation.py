@@ -142,8 +142,10 @@ def continue_cycle(
             "other: such cycles have no branch here."
         )
     down = follow_branch(family, first, -1.0, (low, high), points)
-    # A closed curve is whole by now; its first cycle is its last as well.
+    # A closed curve is whole by one half; its first cycle is its last as well. The other may have ended on the way.
     up = HalfBranch([], down.ending) if down.closed else follow_branch(family, first, 1.0, (low, high), points)
+    if up.closed:
+        down = HalfBranch([], up.ending)
     along = [*reversed(down.points), first, *up.points]
     if derivatives:
         stage("differentiating special points")

@@ -36,8 +36,9 @@ class Cea:
         scene = self.scene.scene()
         dataset = fj.cea.modes(scene, **along)
         fj.save(dataset, data)
+        say(data)
         fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
-        say(data, picture)
+        say(picture)
         limit = fj.cea.stability_limit(scene.structure, direction=direction)
         if limit.outcome is fj.cea.StabilityOutcome.FOUND:
             print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
@@ -58,8 +59,9 @@ class Cea:
             structure = self.scene.reduced()
             dataset = fj.cea.modes(structure, direction=direction, **along)
         fj.save(dataset, data)
+        say(data)
         fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
-        say(data, picture)
+        say(picture)
         limit = fj.cea.stability_limit(structure, direction=direction)
         found = f" {float(limit.mu):.6g} at {float(limit.frequency):.2f} Hz" if limit.mu < float("inf") else ""
         print(f"  critical friction: {limit.outcome.value}{found}")
@@ -126,8 +128,9 @@ class Calibrate:
         bounds = dict(map(bound, self.bound))
         fit = fj.calibrate(self.scene.scene(), recording, free, bounds, starts=self.starts)
         fj.save(fit, data)
+        say(data)
         fj.save_figure(fj.show(fit), picture)
-        say(data, picture)
+        say(picture)
         print(fit)
 
 

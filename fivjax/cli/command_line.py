@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
             command.run()
     except BaseException as error:
         if isinstance(error, Interrupted | KeyboardInterrupt) or received:
-            said = error if isinstance(error, Interrupted) else "Interrupted; nothing was written."
+            said = error if isinstance(error, Interrupted) else "Interrupted; nothing more was written."
             print(f"fivjax: {said}", file=sys.stderr)
             return exit_code(received[0] if received else signal.SIGINT)
         if isinstance(error, MemoryError):

@@ -33,10 +33,11 @@ class CycleCommand:
         except fj.NoLimitCycle as none:
             raise Failure(str(none)) from none
         fj.save(cycle, data)
+        say(data)
         fj.save_figure(fj.plot.cycle(cycle, others), picture)
         for one in (cycle, *others):
             print(one)
-        say(data, picture)
+        say(picture)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +77,7 @@ class Branch:
                 raise Failure(f"{label + ': ' if label else ''}{none}") from none
         for path, found in zip(data, branches.values(), strict=False):
             fj.save(found, path)
+            say(path)
         beside = None
         if upwards is not None:
             low = max(bounds[0], 1e-9) if name == "mu" else bounds[0]
@@ -83,6 +85,7 @@ class Branch:
                 scene, **{name: np.linspace(low, bounds[1], len(upwards[1])), upwards[0]: upwards[1]}
             )
             fj.save(beside, data[-1])
+            say(data[-1])
         fj.save_figure(fj.plot.branch(branches, beside=beside), picture)
         for label, found in branches.items():
             print(
@@ -90,4 +93,4 @@ class Branch:
             )
             for point in np.flatnonzero(found["special"].values != ""):
                 print(f"  {name} = {float(found['parameter'][point]):.10g}: {found['special'].values[point]}")
-        say(*data, picture)
+        say(picture)

@@ -49,5 +49,5 @@ def refuse_existing(*paths: Path) -> None:
 
 
 def say(*paths: Path) -> None:
-    """Print which files were written."""
+    """Print which files have just been written: those that are there if what follows is interrupted."""
     print("\n".join(f"wrote {path}" for path in paths))

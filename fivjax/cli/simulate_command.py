@@ -36,9 +36,10 @@ class Simulate:
         data, picture, *balance = output_paths(self.out, self.overwrite, *endings)
         run = fj.simulate(self.scene.scene(), self.t1, self.dt_save, self.method.stepper(), energy=self.energy)
         fj.save(run, data)
+        say(data)
         fj.save_figure(fj.plot.response(run, self.quantity), picture)
         for path in balance:
             fj.save_figure(fj.plot.energy.balance(run), path)
-        say(data, picture, *balance)
+        say(picture, *balance)
         if run.outcome != fj.Ending.FINISHED:
             print(f"  {run.meaning}")

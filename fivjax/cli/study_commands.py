@@ -53,8 +53,9 @@ class Tradeoff:
             refine=self.refine,
         )
         fj.save(dataset, data)
+        say(data)
         fj.save_figure(fj.plot.tradeoff(dataset), picture)
-        say(data, picture)
+        say(picture)
         print(table(dataset))
 
 

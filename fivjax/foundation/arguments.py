@@ -122,7 +122,8 @@ def known(name: str, value) -> None:
         raise TypeError(
             f"Argument `{name}` must hold known numbers, but is traced by `jax.jit`, `jax.vmap` or a derivative around this "
             "call. Call this function outside of them. Many parameters go on the axes of `bistability_map`; derivatives are "
-            "given by `cycle_derivatives` and by `critical_perturbation(..., derivatives=True)`."
+            "given by `cycle_derivatives` and by `critical_perturbation(..., derivatives=True)`, and in linear theory "
+            "`cea.critical_friction` and `cea.growth_rate` have them."
         )
 
 

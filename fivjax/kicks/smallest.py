@@ -167,6 +167,8 @@ def smallest_kick(
     bounds = arguments.bounds_by_name("bounds", {} if bounds is None else bounds, '"p": (1.0, 2.0)')
     if isinstance(over, str) and over in ("state", "history"):
         return _other(scene, str(over), bounds, pieces)
+    if isinstance(over, str):
+        arguments.one_of("over", over, (*OF_KICK, "state", "history"))
     free = arguments.listed_names("over", over, "p")
     for name in free:
         arguments.one_of("over", name, OF_KICK)

@@ -189,7 +189,8 @@ def _smallest(scene: Scene, over: str, kind: Perturbation, most: float) -> Small
     if not np.any(np.isfinite(found.low)):
         raise NoSquealingKick(
             f"None of the {len(shapes)} shapes that were tried leads to a limit cycle at up to "
-            f"{largest / certificate.size:.3g} times the certified bound. Look with `fivjax.basins`, or kick harder.",
+            f"{largest / certificate.size:.3g} times the certified bound. Look with `fivjax.basins`"
+            f"{', or for other shapes with another number of `pieces` or longest duration' if over == 'history' else ''}.",
             certificate.size,
         )
     best = int(np.nanargmin(np.where(np.isfinite(found.low), found.high, np.nan)))

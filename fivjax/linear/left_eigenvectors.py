@@ -30,16 +30,21 @@ def eigenvalue_derivatives(modes: ComplexModes, changes: Mapping[str, Pencil], w
     **Returns:** by parameter, an array with one complex number for each mode, in 1/s per unit of the parameter. NaN for modes
     with equal eigenvalues, which have no derivative of their own.
 
-    **Raises:** `ValueError` for changes of another size than the pencil's.
+    **Raises:** `ValueError` for changes of another size than the pencil's, and for indices that are not those of modes.
     """
     arguments.instance("modes", modes, ComplexModes, "ComplexModes, as fj.cea.complex_modes gives them")
+    arguments.instance("changes", changes, Mapping, 'a dictionary of pencils, such as {"mu": friction_derivative(...)}')
     for name, change in changes.items():
         arguments.instance(f"changes[{name!r}]", change, Pencil, "a Pencil of the derivatives of M, C and K")
         if change.size != modes.pencil.size:
             raise ValueError(
                 f"Argument `changes[{name!r}]` must have {modes.pencil.size} rows to go with the modes, but has {change.size}."
             )
-    which = np.arange(modes.eigenvalues.size) if which is None else np.atleast_1d(which)
+    count = modes.eigenvalues.size
+    which = np.arange(count) if which is None else np.atleast_1d(arguments.numeric_array("which", which))
+    if not np.all(np.isin(which, np.arange(-count, count))):
+        raise ValueError(f"Argument `which` must hold indices of the {count} modes, but is {which.tolist()}.")
+    which = which.astype(int)
     found = {name: np.full(which.size, np.nan, complex) for name in changes}
     # Left and right eigenvectors that are this nearly orthogonal belong to equal eigenvalues, up to rounding.
     right_angle = 1e-6

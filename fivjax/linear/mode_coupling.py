@@ -85,6 +85,7 @@ def coalescence(structure: Structure, *, damped: bool = False, direction: int = 
         0.22636
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    arguments.known("structure", structure)
     structure = in_contact_coordinates(structure)
     refuse_several_contacts(structure, "`coalescence`", "`growth_rate` takes several.")
     arguments.instance("damped", damped, bool, "True or False")

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.quantities import QUANTITIES
 from ..io.datasets import labelled
@@ -70,6 +71,7 @@ def sensitivity(structure: Structure, *, direction: int = 1) -> Sensitivity:
     """
     import xarray as xr
 
+    arguments.known("structure", structure)
     limit = stability_limit(structure, direction=direction)
     if limit.outcome is not StabilityOutcome.FOUND:
         raise ValueError(

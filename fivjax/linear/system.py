@@ -46,6 +46,8 @@ def with_axes(
 ) -> tuple[Scene, dict[str, np.ndarray]]:
     """The scene with the single numbers set, and the checked axes, `count` of them."""
     arguments.instance("system", system, (Structure, Scene), "a Structure or a Scene")
+    for name, value in {"system": system, **parameters}.items():
+        arguments.known(name, value)
     if isinstance(system, Structure):
         if "mu" not in parameters:
             raise ValueError("Argument `mu` must be given with a structure, as a number or an axis.")

@@ -277,7 +277,10 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
 def refuse_belt_at_rest(scene: Scene) -> None:
     """Refuse a belt that is known to be at rest."""
     if is_known(scene.belt_speed) and np.any(np.asarray(scene.belt_speed) == 0):
-        raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
+        raise ValueError(
+            "Argument `belt_speed` must not be zero for steady sliding. Let the belt move, or give an initial state `y0` to "
+            "`simulate`."
+        )
 
 
 def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, "*contacts"]]:

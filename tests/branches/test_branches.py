@@ -391,6 +391,16 @@ def test_a_closed_curve_is_passed_once_wherever_it_begins(belt_speed):
 
 
 @pytest.mark.slow
+def test_a_closed_curve_is_passed_once_though_one_way_along_it_ends():
+    """Backwards no cycle is found beyond a change of contact modes, to which the other way comes, and goes on."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2, 0.3), 0.8, fj.ConstantLoad(100.0), 1e-3)
+    branch = fj.continue_cycle(scene, "belt_speed", (0.2, 2.0))
+    assert branch.begins == branch.ends == "At belt_speed = 0.8 the branch is back where it began."
+    places = branch.parameter.values[branch.special.values != ""]
+    assert len(places) > 5 and np.all(np.diff(np.sort(places)) > 1e-7)
+
+
+@pytest.mark.slow
 def test_a_grazing_has_a_state_on_the_section_whatever_rounding_makes_of_the_touch():
     branch = fj.continue_cycle(paper(2.0, 0.227), "theta", (0.0065, 0.0105))
     at = int(np.argmax(branch.special.values == "grazing of N: impact inserted"))

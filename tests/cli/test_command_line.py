@@ -125,3 +125,14 @@ def test_where_a_map_is_kept_and_who_computes(monkeypatch, tmp_path, capsys):
     ):
         assert main([*command, "--overwrite", *options]) == 2
         assert said in capsys.readouterr().err
+
+
+def test_an_interrupt_after_the_data_says_that_they_are_there(monkeypatch, tmp_path, capsys):
+    def drawn(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fj, "save_figure", drawn)
+    assert main(["simulate", "--t1", "0.01", "--out", str(tmp_path / "run")]) == 130
+    said = capsys.readouterr()
+    assert f"wrote {tmp_path / 'run.nc'}" in said.out and "nothing more was written" in said.err
+    assert (tmp_path / "run.nc").exists()

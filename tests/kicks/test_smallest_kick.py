@@ -229,3 +229,23 @@ def test_where_the_tangent_leads_to_a_negative_kick_the_step_is_shortened():
         for p in (found.proved_low, found.proved_high)
     )
     assert low.verdict.item() == fj.Verdict.SLIDING and high.verdict.item() == fj.Verdict.LIMIT_CYCLE
+
+
+@pytest.mark.slow
+def test_the_search_goes_on_to_a_minimum_though_a_guess_too_far_off_shortens_its_steps():
+    """A structure drawn at random: p_crit falls so steeply with the duration that tangents lead to no kick."""
+    mass = np.array([[0.6437, 0.0469, -0.0619, -0.0542], [0.0469, 1.1244, -0.0135, -0.0103], [-0.0619, -0.0135, 1.0355, 0.0188], [-0.0542, -0.0103, 0.0188, 0.8404]])  # fmt: skip
+    stiffness = np.array([[2.3778, 0.3634, 0.0633, -0.3304], [0.3634, 3.3578, 0.5005, -0.7407], [0.0633, 0.5005, 2.3044, -0.6531], [-0.3304, -0.7407, -0.6531, 3.3544]])  # fmt: skip
+    structure = fj.Structure(
+        mass, 0.003 * (mass + stiffness), stiffness, [0, -1.2947, 0, 0], contacts=[fj.ContactPoint(0, 1)]
+    )
+    scene = fj.Scene(structure, fj.Coulomb(0.6503), 0.3122, fj.Pulse(1.0, 2.0, duration=3.0))
+    found = fj.smallest_kick(scene, progress=False)
+    beside = fj.bistability_map(
+        scene, duration=np.linspace(0.1, 6.0, 119), p=1 + 0.999 * (found.p - 1) * np.array([0.9, 1.0])
+    )
+    assert not np.any(beside["verdict"] == fj.Verdict.LIMIT_CYCLE)
+    at = fj.critical_perturbation(
+        scene, duration=[found.duration], p_range=(found.p - 1e-3, found.p + 1e-3), p_step=1e-3, derivatives=True
+    )
+    assert abs(float(at["d_p_crit"].sel(parameter="duration").squeeze())) < 1e-7

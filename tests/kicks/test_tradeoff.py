@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 
@@ -48,6 +49,12 @@ def test_state_errors_are_those_against_the_oracle(measured):
 def test_costs_are_costs_and_parts_are_named(measured):
     assert (measured["cost"] > 0).all() and measured["cost"].attrs["units"] == "s"
     assert dict(zip(measured["part"].values, measured["part_cost"].values, strict=True)) == PARTS
+
+
+def test_costs_in_single_precision():
+    """Where mechanics were computed from a scene that is known, a run was half in double precision, and failed."""
+    with jax.enable_x64(True):
+        assert tradeoff_study._cost(tradeoff_study._single(SCENE), fj.WhereSwitched(dt=1e-3), 0.01, 2) > 0
 
 
 @pytest.mark.slow

@@ -683,12 +683,34 @@ def test_an_axis_without_end(tmp_path, capsys):
         lambda scene, mu: fj.bistability_map(scene, mu=[mu]),
         lambda scene, mu: fj.critical_perturbation(scene.replace(mu=mu)),
         lambda scene, mu: fj.smallest_kick(scene.replace(mu=mu)),
+        lambda scene, mu: fj.cea.modes(scene.replace(mu=mu), k1=np.linspace(9e4, 1.1e5, 3)),
+        lambda scene, mu: fj.cea.chart(scene.structure, mu=np.array([0.1, 0.2]), k1=mu * np.array([5e5, 6e5])),
+        lambda scene, mu: fj.cea.coalescence(scene.structure.replace(c1=mu)),
+        lambda scene, mu: fj.cea.sensitivity(scene.structure.replace(c1=mu)),
     ],
 )
 def test_a_scene_traced_by_jax_is_refused_in_a_sentence(paper_scene, call):
     """A search whose course depends on the numbers cannot be traced: the sentence says so, and what gives derivatives."""
     with refused(TypeError, "traced", "Call this function outside"):
         jax.jit(lambda mu: (call(paper_scene, mu), mu)[1])(0.2)
+
+
+def test_derivatives_of_eigenvalues_ask_for_pencils_by_name_and_for_modes_that_there_are(paper_scene):
+    modes = fj.cea.complex_modes(paper_scene.structure, 0.2)
+    change = {"mu": fj.cea.friction_derivative(paper_scene.structure, 0.2)}
+    with refused(TypeError, "changes", "a dictionary of pencils"):
+        fj.cea.eigenvalue_derivatives(modes, [1])
+    for which in ([7], 0.5, [-3]):
+        with refused(ValueError, "which", "indices of the 2 modes"):
+            fj.cea.eigenvalue_derivatives(modes, change, which=which)
+    assert fj.cea.eigenvalue_derivatives(modes, change, which=-1)["mu"].shape == (1,)
+    with refused(ValueError, "mu", "must be non-negative"):
+        fj.cea.friction_derivative(paper_scene.structure, -1.0)
+
+
+def test_what_the_smallest_kick_may_be_sought_over_is_named(paper_scene):
+    with refused(ValueError, "over", '"history"', "Did you mean `state`?"):
+        fj.smallest_kick(paper_scene, over="stat")
 
 
 def test_a_saddle_about_unstable_sliding_is_refused(paper_scene):
