@@ -544,6 +544,7 @@ def test_a_branch_turns_back_where_an_impact_begins_to_end_the_slip_in_the_same_
         np.testing.assert_allclose(run.v[-1], v, atol=1e-7 * float(branch["amplitude"][i]))
 
 
+@pytest.mark.slow
 def test_a_branch_over_the_belts_speed_has_the_corner_of_one_over_friction():
     """There the belt's speed, at which the slip ends, changes along the branch."""
     over_speed = fj.continue_cycle(CORNERED, "belt_speed", (1.45, 1.52), fj.limit_cycle(CORNERED, NEAR_A_CORNER))

@@ -162,6 +162,7 @@ def test_a_saddle_is_found_that_motions_come_to_in_other_modes():
     assert found["d_p_crit"].sel(parameter="mu").values[1] == pytest.approx((high - low) / (2 * step), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_saddle_may_slide_all_the_time():
     """Under falling friction, below a subcritical Hopf point. Rejects asking a saddle for events."""
     friction, load = fj.ExponentialDecay(0.23, 0.1276, 1.76), fj.Pulse(100.0, p=1.8, duration=0.031)
