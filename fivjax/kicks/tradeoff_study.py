@@ -238,12 +238,13 @@ def _cost(scene: Scene, method: AbstractStepper, t1: float, trajectories: int) -
     """Wall time (s) of `trajectories` trajectories that differ a little in their kick, or are copies if there is no kick."""
     if isinstance(scene.load, Pulse):
         each = np.asarray(scene.load.p) * np.linspace(0.99, 1.01, trajectories)
-        one = lambda scene, p: _run(scene, method, t1, p)[0][-1]  # noqa: E731
     else:
         each = np.ones(trajectories)
 
-        def one(scene, factor):
-            return _run(jax.tree.map(lambda leaf: leaf * factor.astype(leaf.dtype), scene), method, t1)[0][-1]
+    def one(scene, own):
+        if isinstance(scene.load, Pulse):
+            return _run(scene, method, t1, own)[0][-1]
+        return _run(jax.tree.map(lambda leaf: leaf * own.astype(leaf.dtype), scene), method, t1)[0][-1]
 
     # The scene is an argument: of a known one mechanics would be computed in double precision.
     run = jax.jit(jax.vmap(one, (None, 0)))

@@ -337,6 +337,7 @@ def test_the_highest_speed_of_a_motion_may_lie_in_a_flight_shorter_than_an_inter
     assert found.amplitude.item() == pytest.approx(seen, rel=1e-4) and seen > 1.2
 
 
+@pytest.mark.slow
 def test_a_gap_that_opens_further_and_closes_within_a_step_is_seen_to_close():
     """It is positive at both ends of the step, and rises at the first: a landing was missed, and the motion came to the other of
     two cycles. The kernel of whole trajectories follows it by series.
@@ -413,6 +414,7 @@ def test_a_motion_that_is_exactly_nothing_slides():
     assert np.all(fj.basins(scene, dq0=[0.0, 1e-300], kick=False, progress=False)["verdict"] == fj.Verdict.SLIDING)
 
 
+@pytest.mark.slow
 def test_on_a_slow_belt_a_cycle_is_looked_for_though_its_events_are_rare():
     """In two thousand periods of the structure there are twenty-six of stick and slip; `limit_cycle` is the reference."""
     stiffness = np.array([[1e4, 924.19], [924.19, 9784.5]])
