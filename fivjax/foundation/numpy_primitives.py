@@ -1,5 +1,6 @@
 """JAX's primitives by NumPy, for values that are known; and which places of arrays the indexing ones read and write."""
 
+import contextlib
 import enum
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
@@ -280,8 +281,10 @@ def _eigen(matrices, left: bool, right: bool):
     shape, size = matrices.shape[:-2], matrices.shape[-1]
     found = [np.full((*shape, *(size,) * (1 + (k > 0))), np.nan, complex) for k in range(kept)]
     for at in np.ndindex(*shape):
-        # Of what is no number nothing is.
-        if np.all(np.isfinite(matrices[at])):
+        # As by JAX, nothing is a number where the matrix is none, or where the routine does not converge.
+        if not np.all(np.isfinite(matrices[at])):
+            continue
+        with contextlib.suppress(np.linalg.LinAlgError):
             parts = linalg.eig(matrices[at], left=left, right=right, check_finite=False)
             for own, part in zip(found, parts if kept > 1 else [parts], strict=True):
                 own[at] = part
