@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..contact import Contact
-from ..foundation.kept_programs import kept
+from ..foundation.numpy_evaluation import by_numpy
 from ..kernels.functions import KernelFunction
 from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
@@ -108,7 +108,7 @@ def _free_states(scene: Scene) -> np.ndarray:
     return sliding_states(scene.structure.size, contact_coordinates(scene.structure)[1])
 
 
-@kept
+@by_numpy
 def _linear(scene: Scene) -> LinearSliding:
     return linear_sliding(scene)
 

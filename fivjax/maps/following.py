@@ -16,7 +16,6 @@ from jaxtyping import Float, Int
 
 from ..contact import Contact, Mechanics
 from ..foundation.blocks import BLOCK_OF_SEVERAL, in_blocks
-from ..foundation.compiling import compiled
 from ..foundation.flattened import Flattened, flatten
 from ..foundation.kept_programs import kept
 from ..section.by_kernel import SectionKernels, section_kernels
@@ -140,7 +139,7 @@ def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.
     ).tree
 
 
-@compiled
+@kept
 def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared: tuple[Mechanics, SlidingModes], y, status, direction):
         mechanics, modes = shared

@@ -465,6 +465,7 @@ def entered_with_mistakes(scene, wrong, lost_impacts, t1):
     return ledger, accounts.residual(energy_data, ledger, y)
 
 
+@pytest.mark.slow
 def test_a_wrong_line_shows_in_the_residual_by_its_size(paper_scene):
     """A damper, a friction coefficient and an impact loss, each entered a little wrong: what the energy_data then say is off by
     that much, and so is the residual."""

@@ -180,6 +180,7 @@ def test_plain_diffeqsolve_gives_what_simulate_gives(paper_scene):
     np.testing.assert_allclose(ys[:, 3:], run.velocity[::100], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_event_exact_interpolates_through_events_inside_a_step(paper_scene):
     """The other stepper is one too, and its dense output as exact as the step, also with several events inside one, and with a
     jump of the load.
