@@ -8,7 +8,6 @@ import re
 from collections.abc import Callable, Sequence
 
 import jax
-import jax.numpy as jnp
 from jax.extend.backend import get_backend
 
 from .matrix_routines import register
@@ -60,7 +59,8 @@ def program_from(content: bytes) -> Callable[[Sequence], list[jax.Array]]:
     executable = get_backend().deserialize_executable(content, devices, None)
 
     def run(arrays: Sequence) -> list[jax.Array]:
-        found = executable.execute_sharded([jnp.asarray(array) for array in arrays])
+        # Not by `jnp.asarray`, which inside a caller's derivative gives tracers, of known numbers, too.
+        found = executable.execute_sharded(jax.device_put(list(arrays)))
         # Waited for, so that a program that cannot run fails here, where another can take its place.
         return jax.block_until_ready([of_device[0] for of_device in found.disassemble_into_single_device_arrays()])
 

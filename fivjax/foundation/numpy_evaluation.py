@@ -38,10 +38,12 @@ def by_numpy(function: Callable[P, R], *, always: bool = False, up_to: float = m
     entries are not: where NumPy's time grows so fast with their number that a single call takes longer than to compile.
     """
 
+    otherwise = compiled(function)
+
     @functools.cache
-    def otherwise() -> Callable[P, R]:
-        # Once it can be told whether the function is found by its name.
-        return kept(function) if _is_named(call) else compiled(function)
+    def of_large_arrays() -> Callable[P, R]:
+        # Once it can be told whether the function is found by its name. A call of what is kept takes longer to begin.
+        return kept(function) if _is_named(call) else otherwise
 
     plans: dict = {}
     lock = threading.RLock()
@@ -52,17 +54,19 @@ def by_numpy(function: Callable[P, R], *, always: bool = False, up_to: float = m
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if transformed((args, kwargs)):
-            return otherwise()(*args, **kwargs)
+            return otherwise(*args, **kwargs)
         form, arrays = Form.of((args, kwargs))
         key = form, *(np.asarray(array).tobytes() for array in arrays)
         if (found := latest.get(key)) is None:
+            if any(array.size > up_to for array in form.arrays):
+                return jax.tree.map(_numbers, of_large_arrays()(*args, **kwargs))
             calls[form] += 1
-            if (calls[form] > REPAID and not always) or any(array.size > up_to for array in form.arrays):
-                return jax.tree.map(_numbers, otherwise()(*args, **kwargs))
+            if calls[form] > REPAID and not always:
+                return jax.tree.map(_numbers, otherwise(*args, **kwargs))
             try:
                 latest[key] = found = computed(form, arrays)
             except NoSuchCase:
-                return jax.tree.map(_numbers, otherwise()(*args, **kwargs))
+                return jax.tree.map(_numbers, otherwise(*args, **kwargs))
             with contextlib.suppress(KeyError):  # where threads leave out the same
                 while len(latest) > (FEW if always else LATEST):
                     latest.popitem(last=False)

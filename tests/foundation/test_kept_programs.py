@@ -18,6 +18,7 @@ import fivjax as fj
 from fivjax.contact import Contact
 from fivjax.foundation import kept_folder, kept_programs
 from fivjax.foundation.flattened import flatten
+from fivjax.foundation.kept_executables import program_from, serialized
 from fivjax.foundation.kept_folder import NotKept
 from fivjax.foundation.kept_programs import kept, kept_value
 from fivjax.foundation.plain_trees import NotPlain, from_text, structure_to_text, to_text
@@ -229,6 +230,23 @@ def test_a_value_of_what_a_user_wrote_is_made_each_time(folder):
     for _ in range(2):
         assert kept_value(lambda law: made.append(law) or law.strength, Own(0.3)) == 0.3
     assert len(made) == 2 and not folder.exists()
+
+
+def test_a_program_from_its_bytes_runs_inside_a_caller_s_derivative():
+    """Where a rule for derivatives computes known values by it, as that of the critical friction of a large structure."""
+    lowered = jax.jit(lambda x: (x[0] * x[1], x[::-1]), keep_unused=True).lower(jnp.ones(2))
+    program = program_from(serialized(lowered, lowered.compile()))
+
+    @jax.custom_jvp
+    def product(x):
+        return program([x])[0]
+
+    @product.defjvp
+    def rule(primals, tangents):
+        value, slopes = program([np.asarray(primals[0])])
+        return value, slopes @ tangents[0]
+
+    assert jax.grad(product)(jnp.array([2.0, 3.0])).tolist() == [3.0, 2.0]
 
 
 IN_A_NEW_PROCESS = """
