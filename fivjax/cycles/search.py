@@ -19,11 +19,10 @@ from ..foundation import arguments
 from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
-from ..linear.several_contacts import free_closed_coordinates
 from ..linear.spectrum import linearisation
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
-from ..model.sliding import contact_coordinates
+from ..model.sliding import contact_coordinates, sliding_states
 from ..section.about_sliding import sliding_state
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps
@@ -255,10 +254,10 @@ def _released(
 def _along_modes(scene: Scene, maps: ReturnMaps) -> Float[np.ndarray, "m 2n"]:
     """Deviations along each mode of steady sliding, of several sizes and at two instants of its period."""
     values, shapes = np.linalg.eig(np.asarray(linearisation(under_final_load(scene))))
-    free, n = free_closed_coordinates(scene.structure), scene.structure.size
+    n, (tangential, normal) = scene.structure.size, contact_coordinates(scene.structure)
     full = np.zeros((len(values), 2 * n), complex)
-    full[:, np.concatenate([free, n + free])] = shapes.T
-    along = n + np.atleast_1d(maps.tangential)
+    full[:, sliding_states(n, normal)] = shapes.T
+    along = n + np.atleast_1d(tangential)
     sizes, speeds = np.abs(maps.weights * full), full[:, along] / np.atleast_1d(scene.belt_speed)
     # Of a mode that hardly moves a contact, motions would be without measure.
     vibrating = (values.imag > 0) & (np.max(sizes[:, along], axis=1) > 1e-3 * np.max(sizes, axis=1))

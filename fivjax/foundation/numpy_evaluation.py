@@ -37,7 +37,6 @@ def by_numpy(function: Callable[P, R], *, always: bool = False, up_to: float = m
     With `always`, so are later calls: where it matters that all are rounded alike. Calls with an array of more than `up_to`
     entries are not: where NumPy's time grows so fast with their number that a single call takes longer than to compile.
     """
-
     otherwise = compiled(function)
 
     @functools.cache
@@ -58,7 +57,7 @@ def by_numpy(function: Callable[P, R], *, always: bool = False, up_to: float = m
         form, arrays = Form.of((args, kwargs))
         key = form, *(np.asarray(array).tobytes() for array in arrays)
         if (found := latest.get(key)) is None:
-            if any(array.size > up_to for array in form.arrays):
+            if up_to < math.inf and any(array.size > up_to for array in form.arrays):
                 return jax.tree.map(_numbers, of_large_arrays()(*args, **kwargs))
             calls[form] += 1
             if calls[form] > REPAID and not always:

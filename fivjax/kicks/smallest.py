@@ -165,10 +165,10 @@ def smallest_kick(
     if not scene.friction.constant:
         raise ValueError("Argument `scene` must have constant friction: the bound is that of a linear sliding motion.")
     bounds = arguments.bounds_by_name("bounds", {} if bounds is None else bounds, '"p": (1.0, 2.0)')
-    if isinstance(over, str) and over in ("state", "history"):
-        return _other(scene, str(over), bounds, pieces)
     if isinstance(over, str):
         arguments.one_of("over", over, (*OF_KICK, "state", "history"))
+        if over not in OF_KICK:
+            return _other(scene, str(over), bounds, pieces)
     free = arguments.listed_names("over", over, "p")
     for name in free:
         arguments.one_of("over", name, OF_KICK)
