@@ -10,7 +10,7 @@ import tyro
 import fivjax as fj
 
 from .options import SceneOptions
-from .outputs import Overwrite, output_paths, say
+from .outputs import Overwrite, output_paths, write_data, write_picture
 from .parsing import axis, bound, low_pass, pair
 from .structure_options import StructureOptions
 
@@ -35,10 +35,8 @@ class Cea:
             return
         scene = self.scene.scene()
         dataset = fj.cea.modes(scene, **along)
-        fj.save(dataset, data)
-        say(data)
-        fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
-        say(picture)
+        write_data(dataset, data)
+        write_picture(fj.plot.linear.eigenvalues(dataset), picture)
         limit = fj.cea.stability_limit(scene.structure, direction=direction)
         if limit.outcome is fj.cea.StabilityOutcome.FOUND:
             print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
@@ -58,10 +56,8 @@ class Cea:
         else:
             structure = self.scene.reduced()
             dataset = fj.cea.modes(structure, direction=direction, **along)
-        fj.save(dataset, data)
-        say(data)
-        fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
-        say(picture)
+        write_data(dataset, data)
+        write_picture(fj.plot.linear.eigenvalues(dataset), picture)
         limit = fj.cea.stability_limit(structure, direction=direction)
         found = f" {float(limit.mu):.6g} at {float(limit.frequency):.2f} Hz" if limit.mu < float("inf") else ""
         print(f"  critical friction: {limit.outcome.value}{found}")
@@ -127,10 +123,8 @@ class Calibrate:
             raise ValueError(with_options(str(error))) from None
         bounds = dict(map(bound, self.bound))
         fit = fj.calibrate(self.scene.scene(), recording, free, bounds, starts=self.starts)
-        fj.save(fit, data)
-        say(data)
-        fj.save_figure(fj.show(fit), picture)
-        say(picture)
+        write_data(fit, data)
+        write_picture(fj.show(fit), picture)
         print(fit)
 
 

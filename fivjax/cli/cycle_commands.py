@@ -8,7 +8,7 @@ import tyro
 
 import fivjax as fj
 
-from .outputs import Failure, Overwrite, output_paths, say
+from .outputs import Failure, Overwrite, output_paths, write_data, write_picture
 from .parsing import axis, bound
 from .structure_options import StructureOptions
 
@@ -32,12 +32,10 @@ class CycleCommand:
             others = [fj.saddle_cycle(scene, cycle)] if self.saddle else []
         except fj.NoLimitCycle as none:
             raise Failure(str(none)) from none
-        fj.save(cycle, data)
-        say(data)
-        fj.save_figure(fj.plot.cycle(cycle, others), picture)
+        write_data(cycle, data)
+        write_picture(fj.plot.cycle(cycle, others), picture)
         for one in (cycle, *others):
             print(one)
-        say(picture)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,21 +74,18 @@ class Branch:
             except fj.NoLimitCycle as none:
                 raise Failure(f"{label + ': ' if label else ''}{none}") from none
         for path, found in zip(data, branches.values(), strict=False):
-            fj.save(found, path)
-            say(path)
+            write_data(found, path)
         beside = None
         if upwards is not None:
             low = max(bounds[0], 1e-9) if name == "mu" else bounds[0]
             beside = fj.bistability_map(
                 scene, **{name: np.linspace(low, bounds[1], len(upwards[1])), upwards[0]: upwards[1]}
             )
-            fj.save(beside, data[-1])
-            say(data[-1])
-        fj.save_figure(fj.plot.branch(branches, beside=beside), picture)
+            write_data(beside, data[-1])
+        write_picture(fj.plot.branch(branches, beside=beside), picture)
         for label, found in branches.items():
             print(
                 f"{label + ': ' if label else ''}{found.sizes['point']} cycles. {found.attrs['begins']} {found.attrs['ends']}"
             )
             for point in np.flatnonzero(found["special"].values != ""):
                 print(f"  {name} = {float(found['parameter'][point]):.10g}: {found['special'].values[point]}")
-        say(picture)

@@ -13,7 +13,7 @@ import tyro
 import fivjax as fj
 
 from .options import MethodOptions
-from .outputs import Failure, Interrupted, Overwrite, output_paths, say
+from .outputs import Failure, Interrupted, Overwrite, output_paths, write_data, write_picture
 from .parsing import axis, number
 from .structure_options import StructureOptions
 from .workers import workers_of
@@ -110,14 +110,13 @@ class Map:
                 )
             if np.any(dataset["verdict"] == fj.Verdict.NOT_RUN):
                 raise KeyboardInterrupt
-            fj.save(dataset, data)
-            fj.save_figure(fj.plot.bistability(dataset), picture)
+            write_data(dataset, data)
+            write_picture(fj.plot.bistability(dataset), picture)
         except KeyboardInterrupt:
             raise Interrupted(_how_to_resume(folder, unfinished, jobs)) from None
         if folder is None:
             unfinished.unlink(missing_ok=True)
             shutil.rmtree(jobs, ignore_errors=True)
-        say(data, picture)
         counts = {verdict: int((dataset["verdict"] == verdict).sum()) for verdict in fj.Verdict}
         for verdict, count in counts.items():
             if count:

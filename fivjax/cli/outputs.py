@@ -5,6 +5,8 @@ from typing import Annotated
 
 import tyro
 
+import fivjax as fj
+
 from ..io.files import check_writable
 
 # An option of every command that writes files. It is not called --force, because that is the load.
@@ -48,6 +50,18 @@ def refuse_existing(*paths: Path) -> None:
         )
 
 
-def say(*paths: Path) -> None:
-    """Print which files have just been written: those that are there if what follows is interrupted."""
-    print("\n".join(f"wrote {path}" for path in paths))
+def write_data(result, path: Path) -> None:
+    """Save a result, and print where at once: it is there if what follows is interrupted."""
+    fj.save(result, path)
+    say(path)
+
+
+def write_picture(figure, path: Path) -> None:
+    """The same of a picture."""
+    fj.save_figure(figure, path)
+    say(path)
+
+
+def say(path: Path) -> None:
+    """Print that a file was written."""
+    print(f"wrote {path}")

@@ -9,7 +9,7 @@ import tyro
 import fivjax as fj
 
 from .options import MethodOptions
-from .outputs import Overwrite, output_paths, say
+from .outputs import Overwrite, output_paths, write_data, write_picture
 from .structure_options import StructureOptions
 
 
@@ -35,11 +35,9 @@ class Simulate:
         endings = (".nc", ".png", "_energy.png") if self.energy else (".nc", ".png")
         data, picture, *balance = output_paths(self.out, self.overwrite, *endings)
         run = fj.simulate(self.scene.scene(), self.t1, self.dt_save, self.method.stepper(), energy=self.energy)
-        fj.save(run, data)
-        say(data)
-        fj.save_figure(fj.plot.response(run, self.quantity), picture)
+        write_data(run, data)
+        write_picture(fj.plot.response(run, self.quantity), picture)
         for path in balance:
-            fj.save_figure(fj.plot.energy.balance(run), path)
-        say(picture, *balance)
+            write_picture(fj.plot.energy.balance(run), path)
         if run.outcome != fj.Ending.FINISHED:
             print(f"  {run.meaning}")

@@ -10,7 +10,7 @@ import tyro
 import fivjax as fj
 
 from .options import SceneOptions
-from .outputs import Overwrite, output_paths, refuse_existing, say
+from .outputs import Overwrite, output_paths, refuse_existing, say, write_data, write_picture
 from .parsing import number
 
 
@@ -52,10 +52,8 @@ class Tradeoff:
             boundary=self.boundary,
             refine=self.refine,
         )
-        fj.save(dataset, data)
-        say(data)
-        fj.save_figure(fj.plot.tradeoff(dataset), picture)
-        say(picture)
+        write_data(dataset, data)
+        write_picture(fj.plot.tradeoff(dataset), picture)
         print(table(dataset))
 
 
