@@ -11,6 +11,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
 from ..io.datasets import labelled
+from ..model.scene import Scene
 from ..section.return_maps import ReturnMaps
 from .continuation import cycle_at
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 # Relative distances from the cycle at which motions are released: inside and outside of a small torus.
 RELEASED = (1e-3, -1e-3, 0.02, -0.02)
-KINDS = ("torus", "locked", "another cycle", "none")
 
 
 @reported("tori")
@@ -60,16 +60,16 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
         if len(places)
         else places
     )
-    kinds, amplitudes, rotation, scene = [], [], [], None
+    kinds, amplitudes, rotation = [], [], []
     for place in places:
         cycle = cycle_at(branch, int(place))
-        scene = cycle.scene
         found = _attractor(cycle)
-        kind = KINDS[3]
-        if found is not None:
-            more = found.crossings > cycle.crossings
-            kind = KINDS[0] if found.kind == "torus" else KINDS[1] if more else KINDS[2]
-        kinds.append(kind)
+        if found is None:
+            kinds.append("none")
+        elif found.kind == "torus":
+            kinds.append("torus")
+        else:
+            kinds.append("locked" if found.crossings > cycle.crossings else "another cycle")
         amplitudes.append(np.nan if found is None else float(found.amplitude))
         turns = None if found is None else found.rotation_number
         rotation.append(np.nan if turns is None else float(turns))
@@ -82,9 +82,7 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
             "rotation_number": ("point", rotation),
         }
     )
-    if scene is None:
-        return dataset.assign_attrs(parameter=branch.attrs["parameter"])
-    return labelled(dataset, scene).assign_attrs(parameter=branch.attrs["parameter"])
+    return labelled(dataset, Scene.from_dataset(branch)).assign_attrs(parameter=branch.attrs["parameter"])
 
 
 def turning(multipliers: np.ndarray) -> np.ndarray:

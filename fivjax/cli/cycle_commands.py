@@ -8,6 +8,7 @@ import tyro
 
 import fivjax as fj
 
+from ..foundation.digits import apart
 from .outputs import Failure, Overwrite, output_paths, write_data, write_picture
 from .parsing import axis, bound
 from .structure_options import StructureOptions
@@ -66,15 +67,14 @@ class Branch:
         upwards = None if self.map is None else axis(self.map)
         scene = self.scene.scene()
         branches = {}
-        for value in values:
-            label = "" if other is None else f"{other} = {value:g}"
+        labels = [""] if other is None else [f"{other} = {value}" for value in apart(*values)]
+        for value, label, path in zip(values, labels, data, strict=False):
             here = scene if other is None else scene.replace(**{other: value})
             try:
                 branches[label] = fj.continue_cycle(here, name, bounds, points=self.points)
             except fj.NoLimitCycle as none:
                 raise Failure(f"{label + ': ' if label else ''}{none}") from none
-        for path, found in zip(data, branches.values(), strict=False):
-            write_data(found, path)
+            write_data(branches[label], path)
         beside = None
         if upwards is not None:
             low = max(bounds[0], 1e-9) if name == "mu" else bounds[0]

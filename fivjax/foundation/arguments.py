@@ -170,6 +170,10 @@ def path(name: str, value) -> Path:
     """A path, from a string or a path."""
     if not isinstance(value, str | Path):
         raise TypeError(f"Argument `{name}` must be a path, as a string or a `pathlib.Path`, but is {describe(value)}.")
+    if "\0" in str(value):
+        raise ValueError(
+            f"Argument `{name}` must not hold the character NUL, but is {str(value)!r}. Give another path."
+        )
     return Path(value)
 
 

@@ -4,9 +4,10 @@ A block consists of rows. The trajectories of a row belong to one *group* and sh
 threads, one per core or device.
 """
 
+import collections
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor, wait
 
 import jax
 import numpy as np
@@ -42,11 +43,16 @@ def in_threads(run: Callable, parts: Iterable, pool: Executor, threads: int) -> 
             run(part)
 
     others = [pool.submit(work) for _ in range(threads - 1)]
-    work()
-    for other in others:
-        # One that has not begun by now has nothing to do.
-        if not other.cancel():
-            other.result()
+    try:
+        work()
+    finally:
+        # Where this thread fails or is interrupted, too, the others end before the arrays that they write to are gone. One that
+        # has not begun by now has nothing to do.
+        collections.deque(left, maxlen=0)
+        running = [other for other in others if not other.cancel()]
+        wait(running)
+    for other in running:
+        other.result()
 
 
 def in_blocks(

@@ -209,11 +209,11 @@ def _window(shape, start, sizes, mode) -> tuple[slice, ...] | None:
 
 def _gathered(array, places, params):
     # Mostly the same places are read again and again.
-    known, key = params.setdefault("known", {}), (array.shape, places.shape, places.tobytes())
-    if key not in known:
-        known.clear()
-        known[key] = gathered_places(array.shape, places, params)
-    found = known[key]
+    key = array.shape, places.shape, places.tobytes()
+    last, found = params.get("latest", (None, None))
+    if last != key:
+        found = gathered_places(array.shape, places, params)
+        params["latest"] = key, found
     return None if found is None else array.ravel()[found]
 
 

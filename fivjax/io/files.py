@@ -13,11 +13,13 @@ class MissingFile(FileNotFoundError, ValueError):
 
 
 def check_there(path: Path, of: str = "") -> None:
-    """Refuse the path of a file that is not there; `of` what it is."""
+    """Refuse the path of a file that is not there, or cannot be read; `of` what it is."""
     if not path.is_file():
         raise MissingFile(
             f"File `{path}`{of} {'is a folder; give the name of a file in it' if path.is_dir() else 'does not exist'}."
         )
+    if not os.access(path, os.R_OK):
+        raise ValueError(f"File `{path}`{of} is protected against reading; permit reading it, or give another.")
 
 
 def check_writable(path: str | Path) -> Path:

@@ -54,7 +54,9 @@ class SmallestKick(NamedTuple):
     p: float  # of the smallest kick found that leads to a limit cycle
     duration: float  # of that kick, s
     certified: float  # every kick with p between 1 and this slides for ever, for all durations within the bounds
-    proved_low: float  # a kick of the same duration with this p was proved to slide,
+    proved_low: (
+        float  # a kick of the same duration with this p was proved to slide (NaN: p is the least of the bounds),
+    )
     proved_high: float  # and one with this p to end on a limit cycle
     scene: Scene | None = None  # the one that was asked about
 
@@ -208,7 +210,8 @@ def smallest_kick(
     at = critical_perturbation(
         scene, duration=[duration], p_range=(p - 1e-4, p + 1e-4), p_step=1e-4, derivatives=True, progress=False
     ).isel(duration=0)
-    if np.isfinite(at["p_crit"]):
+    # Where its lower end squeals already, the guess was too far off to say how small a kick may be.
+    if np.isfinite(at["p_crit_low"]):
         row, p = at, float(at["p_crit"])
     else:
         duration, p = float(starts[best]), float(row["p_crit"])

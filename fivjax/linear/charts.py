@@ -81,7 +81,8 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
         {name: (tuple(axes), v, {"long_name": long, "units": unit}) for name, (v, long, unit) in variables.items()},
         coords=axes,
     )
-    return labelled(dataset, scene, analysis="stability chart", method="characteristic polynomial, Routh-Hurwitz")
+    method = "characteristic polynomial, Routh-Hurwitz" if expanded else "eigenvalues"
+    return labelled(dataset, scene, analysis="stability chart", method=method)
 
 
 @kept

@@ -98,7 +98,7 @@ def raise_critical_friction(
     **Raises:** `ValueError` for unknown names, bounds that do not contain the structure's own value, and a structure without
     critical friction.
     """
-    _check_bounds(structure, bounds, tied or {})
+    within = _checked_bounds(structure, bounds, tied or {})
     if target is not None:
         arguments.real_number("target", target, above=0)
 
@@ -110,8 +110,8 @@ def raise_critical_friction(
         raise ValueError(
             f"There is no critical friction to raise: the structure is {'never' if start else 'always'} unstable."
         )
-    goal = _Goal("critical friction", quantity, target, larger_is_better=True)
-    return _design(structure, bounds, tied or {}, goal, steps, rate)
+    goal = _Goal("critical friction", quantity, target, direction, larger_is_better=True)
+    return _design(structure, within, tied or {}, goal, steps, rate)
 
 
 @in_double_precision
@@ -149,8 +149,8 @@ def lower_growth_rate(
         values = real(frictions)
         return jnp.max(jax.vmap(lambda value: growth_rate(candidate, value, direction=direction))(values))
 
-    goal = _Goal("worst growth rate", quantity, target, larger_is_better=False)
-    return _design(structure, bounds, tied or {}, goal, steps, rate)
+    goal = _Goal("worst growth rate", quantity, target, direction, larger_is_better=False)
+    return _design(structure, _checked_bounds(structure, bounds, tied or {}), tied or {}, goal, steps, rate)
 
 
 class _Goal(NamedTuple):
@@ -159,6 +159,7 @@ class _Goal(NamedTuple):
     name: str
     quantity: Callable
     target: float | None
+    direction: int  # of the belt
     larger_is_better: bool
 
     def loss(self, value):
@@ -168,14 +169,13 @@ class _Goal(NamedTuple):
         return value if self.target is None else jnp.maximum(value, self.target)
 
 
-def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: float) -> Design:
+def _design(structure: Structure, within: "_Bounds", tied, goal: _Goal, steps: int, rate: float) -> Design:
     import optax
     import xarray as xr
 
-    name, quantity, target, larger_is_better = goal
-    bounds, low, width = _check_bounds(structure, bounds, tied)
-    check_axis_names({*bounds, *tied}, ("step", name.replace(" ", "_")), "designs")
-    names = list(bounds)
+    name, quantity, target, direction, larger_is_better = goal
+    names, low, width = within
+    check_axis_names({*names, *tied}, ("step", name.replace(" ", "_")), "designs")
     start = np.array([(float(structure.parameters[key]) - low[i]) / width[i] for i, key in enumerate(names)])
 
     def values(shares):
@@ -220,14 +220,22 @@ def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: f
         coords={"step": np.arange(steps + 1)},
     ).isel(step=slice(taken))
     history[name.replace(" ", "_")].attrs.update(long_name=name, units="1" if larger_is_better else "1/s")
-    history = labelled(history, as_scene(structure, 0.0, 1), analysis="design by gradient", quantity=name)
+    history = labelled(history, as_scene(structure, 0.0, direction), analysis="design by gradient", quantity=name)
     history.attrs["chosen_step"] = best
     if target is not None:
         history.attrs["target"] = float(target)
     return Design(structure.replace(**parameters), parameters, before, after, target, outcome, name, history)
 
 
-def _check_bounds(structure: Structure, bounds, tied):
+class _Bounds(NamedTuple):
+    """What the parameters of a design may be."""
+
+    names: list[str]
+    low: np.ndarray
+    width: np.ndarray
+
+
+def _checked_bounds(structure: Structure, bounds, tied) -> _Bounds:
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     bounds = arguments.bounds_by_name("bounds", bounds, '"k1": (90e3, 110e3)')
     if not bounds:
@@ -242,4 +250,4 @@ def _check_bounds(structure: Structure, bounds, tied):
         structure.replace(**{key: pair[0]})
         structure.replace(**{key: pair[1]})
     table = np.array([bounds[key] for key in bounds], dtype=np.float64)
-    return dict(bounds), table[:, 0], table[:, 1] - table[:, 0]
+    return _Bounds(list(bounds), table[:, 0], table[:, 1] - table[:, 0])

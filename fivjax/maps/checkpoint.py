@@ -28,6 +28,7 @@ from ..verdicts.verdict import Verdict
 from .job_files import attractors_from_bytes, attractors_to_bytes, file_of, runs_of
 from .plan import Indices
 from .results import Verdicts, by_name, not_run
+from .run_lock import RunLock
 
 KIND = "fivjax checkpoint"
 # Time between writes, s, and in times of what the latest took: long enough to cost nothing, short enough to lose little.
@@ -65,7 +66,25 @@ class Checkpoint:
         # The indices of the results, in rising order, unless there is one for each trajectory; and those of jobs since then.
         self._places, self._more = np.zeros(0, np.int64) if total is None else None, []
         self._new, self._done, self._took = False, [], 0.0
-        kept = read_checkpoint(path, run)
+        check_writable(path)
+        self._lock = self._locked()
+        try:
+            self._read(energy)
+        except BaseException:
+            self._release()
+            raise
+        self._written = time.monotonic()
+
+    def _locked(self) -> RunLock | None:
+        """The lock on the run; none where no folder can be made for it (a full disk)."""
+        with contextlib.suppress(OSError):
+            self._jobs.mkdir(exist_ok=True)
+            return RunLock(self._jobs, f"Checkpoint `{self.path}`")
+        return None
+
+    def _read(self, energy: bool) -> None:
+        run = self.run
+        kept = read_checkpoint(self.path, run)
         if kept is None:
             # Interrupted before its first job was done: nothing else is left of a run.
             for theirs in runs_of(self._jobs):
@@ -78,7 +97,6 @@ class Checkpoint:
                 values[:] = kept.results[name]
             self._new = self._leave_out_damage(kept)
             self.found = {place: attractors_from_bytes(content) for place, content in kept.found.items()}
-        self._written = time.monotonic()
 
     def _leave_out_damage(self, kept: Contents) -> bool:
         """Damaged results count as not run; whether there are any, or other damage."""
@@ -87,14 +105,14 @@ class Checkpoint:
                 warnings.warn(
                     f"Checkpoint `{self.path}` is damaged: the `{name}` of trajectories {part.start} to {part.stop - 1} is not "
                     f"what was written. These trajectories are computed anew.",
-                    stacklevel=5,
+                    stacklevel=6,
                 )
                 self.verdicts.verdict[part] = Verdict.NOT_RUN
         if self._places is not None:
             whole = ~self.verdicts.pending()
             self._places, self.verdicts = self._places[whole], jax.tree.map(lambda part: part[whole], self.verdicts)
         if kept.elsewhere:
-            warnings.warn(f"Checkpoint `{self.path}` is damaged beside its results; it is written anew.", stacklevel=5)
+            warnings.warn(f"Checkpoint `{self.path}` is damaged beside its results; it is written anew.", stacklevel=6)
         return bool(kept.damaged) or kept.elsewhere
 
     def recall(self, places: Indices | None) -> Verdicts:
@@ -138,12 +156,16 @@ class Checkpoint:
             self.flush()
 
     def close(self) -> None:
-        """Remove the folder of jobs under way if there are none."""
-        if self._places is not None:
-            with contextlib.suppress(OSError):
-                self._jobs.rmdir()
-        elif not self.verdicts.pending().any():
+        """Release the lock, and remove the folder of jobs under way if there are none."""
+        if self._places is None and not self.verdicts.pending().any():
             shutil.rmtree(self._jobs, ignore_errors=True)
+        self._release()
+
+    def _release(self) -> None:
+        if self._lock is not None:
+            self._lock.remove()
+        with contextlib.suppress(OSError):
+            self._jobs.rmdir()
 
     def flush(self) -> None:
         """Write results that are not written yet."""

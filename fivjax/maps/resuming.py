@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from .. import contact as physics
 from ..foundation import arguments
 from ..foundation.traced_code import digest, is_from_outside
+from ..io.files import check_writable
 from ..model.description import code_of, describe
 from ..model.scene import Scene
 from ..section.about_sliding import mechanics_about_sliding
@@ -38,6 +39,10 @@ def keeper_at(
     if path is None:
         return None
     arguments.instance("resume", path, str | Path, 'the path of a file, such as "map.part", or of a folder "map.zarr"')
+    if not is_store(path):
+        check_writable(path)
+    # The working directory may change while the map is computed.
+    path = Path(path).absolute()
     # Packages whose versions may change a map's last bits.
     packages = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "equinox")
     run = {

@@ -16,8 +16,6 @@ import errno
 import json
 import math
 import os
-import platform
-import time
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -33,9 +31,10 @@ from .checkpoint import refuse_other_run
 from .job_files import attractors_from_bytes, attractors_to_bytes, file_of
 from .plan import Grid, Indices, Tiles
 from .results import Verdicts, by_name, not_run
+from .run_lock import RunLock
 
 KIND = "fivjax store"
-CHECKSUMS, LOCK = "checksums", ".lock"
+CHECKSUMS = "checksums"
 HOW_ON = "Delete it to begin the run anew, or give another path."
 
 
@@ -66,7 +65,7 @@ class Store:
                 create(self.path, self.run, grid, tile, fields)
         check_begun(self.path, self.run, grid, tile, fields)
         with _naming(self.path):
-            self._lock = lock(self.path)
+            self._lock = RunLock(self.path, f"Store `{self.path}`")
         try:
             # A chunk without a file is one that was not written, or is lost.
             with zarr().config.set({"array.write_empty_chunks": True}):
@@ -79,7 +78,7 @@ class Store:
                 with contextlib.suppress(OSError, Damaged, ValueError):
                     self.found[int(file.stem)] = attractors_from_bytes(unsealed(file.read_bytes()))
         except BaseException:
-            self._lock.close()
+            self._lock.release()
             raise
 
     def _chunks_begun(self) -> Iterator[int]:
@@ -161,7 +160,7 @@ class Store:
         """Release the lock, so that other processes may write."""
         with contextlib.suppress(OSError):  # jobs are under way, or there never were any
             (self.path / JOBS).rmdir()
-        self._lock.close()
+        self._lock.release()
 
 
 @contextlib.contextmanager
@@ -288,31 +287,3 @@ def _checksum(file: Path) -> int | None:
         return zlib.crc32(file.read_bytes())
     except OSError:
         return None
-
-
-def lock(path: Path):
-    """A lock on the store, which the operating system releases at the latest when the process ends.
-
-    **Raises:** `ValueError` where another process has it, saying which.
-    """
-    file = open(path / LOCK, "a+")  # noqa: SIM115
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return file
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        file.seek(0)
-        holder = file.read().strip()
-        file.close()
-        raise ValueError(
-            f"Store `{path}` is being written by another process{f', {holder}' if holder else ''}; wait for it, or end it."
-        ) from None
-    except OSError:  # a file system without locks
-        pass
-    with contextlib.suppress(OSError):  # a full disk
-        file.truncate(0)
-        file.write(f"number {os.getpid()} on {platform.node()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
-        file.flush()
-    return file

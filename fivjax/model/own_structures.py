@@ -2,6 +2,7 @@
 datasets hold none of their code, and find it here.
 """
 
+import threading
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -18,6 +19,7 @@ Maker = Callable[..., Any]
 # The most functions that are remembered, the newest: a notebook may define one again and again.
 MOST = 64
 _MADE: dict[Hashable, tuple[Callable, Maker]] = {}
+_remembering = threading.Lock()
 
 
 def check_name(name: str) -> None:
@@ -32,12 +34,14 @@ def check_name(name: str) -> None:
 def remember(function: Callable, settings: Hashable, maker: Maker) -> None:
     """Remember how a structure is made of its parameters, by name; the `function` and its `settings` tell it from others."""
     key = id(function), settings
-    _MADE.pop(key, None)
-    _MADE[key] = function, maker
-    if len(_MADE) > MOST:
-        del _MADE[next(iter(_MADE))]
+    with _remembering:
+        _MADE.pop(key, None)
+        _MADE[key] = function, maker
+        if len(_MADE) > MOST:
+            del _MADE[next(iter(_MADE))]
 
 
 def remembered() -> list[Maker]:
     """How structures of this process were made, the newest first."""
-    return [maker for _, maker in _MADE.values()][::-1]
+    with _remembering:
+        return [maker for _, maker in _MADE.values()][::-1]

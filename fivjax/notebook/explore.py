@@ -34,8 +34,8 @@ def explorer(
         fj.explorer(scene, fj.bistability_map(scene, mu=…, p=…))  # a click on the map opens that trajectory
 
     A map belongs to the parameters for which it was computed: when other sliders change, it is greyed out, and a button
-    computes it anew. With several contacts, each has its colour and its row of statuses; parameters that hold a value for each
-    contact have no slider.
+    computes it anew, event by event. With several contacts, each has its colour and its row of statuses; parameters that hold
+    a value for each contact have no slider.
 
     **Arguments:** `scene`, which gives the first values of the sliders; `dataset`, a map over two of the scene's parameters;
     `t1`, the time to simulate, in s; `ranges`, the ends of sliders by name of parameter.
@@ -43,7 +43,7 @@ def explorer(
     **Returns:** an `Explorer`, which notebooks display.
 
     **Raises:** `ImportError` where ipywidgets or anywidget is missing, `ValueError` for unknown parameters or a map without
-    two axes.
+    two axes that are parameters of the scene.
 
     **Example:**
 

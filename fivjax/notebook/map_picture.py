@@ -18,6 +18,12 @@ class MapPicture:
         self.dataset = dataset
         self.scene = Scene.from_dataset(dataset) if "scene" in dataset.attrs else scene
         self.values = {str(name): dataset[name].values for name in dataset["verdict"].dims}
+        unknown = [name for name in self.values if name not in scene.parameters]
+        if unknown:
+            raise ValueError(
+                f"Argument `dataset` must be a map over parameters of the scene, but `{unknown[0]}` is none; it has: "
+                f"{', '.join(sorted(scene.parameters))}."
+            )
         figure = plot.bistability(dataset)
         if len(self.values) != 2:
             raise ValueError(

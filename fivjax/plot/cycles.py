@@ -49,7 +49,7 @@ def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figur
     plane.set(xlabel="tangential displacement (mm)", ylabel="tangential velocity (m/s)")
     legend_above(plane, handles, columns=3)
     if cycle.kind == "torus":
-        _section(right, cycle)
+        _section(right, cycle, contact)
     else:
         _multipliers(right, cycle)
     return figure
@@ -98,12 +98,16 @@ def _multipliers(axes: Axes, cycle: LimitCycle) -> None:
     legend_above(axes, axes.get_legend_handles_labels()[0], columns=2)
 
 
-def _section(axes: Axes, cycle: LimitCycle) -> None:
-    n = cycle.scene.structure.size
-    tangential, normal = cycle.scene.structure.tangential, cycle.scene.structure.normal
-    others = [k for k in range(n) if k not in (tangential, normal)]
-    second = others[0] if others else normal
-    name = cycle.scene.structure.coordinates[second]
-    first = cycle.scene.structure.coordinates[tangential]
-    axes.plot(1e3 * cycle.points[:, tangential], cycle.points[:, n + second], ".", color=BLUE, ms=2)
-    axes.set(xlabel=f"{first} on the section, from equilibrium (mm)", ylabel=f"velocity of {name} (m/s)")
+def _section(axes: Axes, cycle: LimitCycle, contact: int) -> None:
+    structure = cycle.scene.structure
+    tangential, normal = structure.tangential_directions[:, contact], structure.normal_directions[:, contact]
+    # Upwards a coordinate that is not the contact's own, if there is one.
+    second = int(np.argmin((tangential != 0) | (normal != 0)))
+    moved = np.flatnonzero(tangential)
+    first = structure.coordinates[moved[0]] if len(moved) == 1 else f"tangential displacement of contact {contact}"
+    n = structure.size
+    axes.plot(1e3 * cycle.points[:, :n] @ tangential, cycle.points[:, n + second], ".", color=BLUE, ms=2)
+    axes.set(
+        xlabel=f"{first} on the section, from equilibrium (mm)",
+        ylabel=f"velocity of {structure.coordinates[second]} (m/s)",
+    )

@@ -296,7 +296,9 @@ def test_a_branch_of_strongly_stable_cycles_has_no_special_points():
 
 def test_where_no_pair_of_multipliers_grows_there_are_no_tori(branch):
     """The saddle of this branch is unstable in one real direction: nothing is released beside it."""
-    assert fj.tori_along(branch).sizes["point"] == 0
+    none = fj.tori_along(branch)
+    assert none.sizes["point"] == 0
+    assert none.attrs["scene"] == branch.attrs["scene"]
     with pytest.raises(ValueError, match="must come from"):
         fj.tori_along(branch.drop_vars("multipliers"))
 

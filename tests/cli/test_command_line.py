@@ -136,3 +136,18 @@ def test_an_interrupt_after_the_data_says_that_they_are_there(monkeypatch, tmp_p
     said = capsys.readouterr()
     assert f"wrote {tmp_path / 'run.nc'}" in said.out and "nothing more was written" in said.err
     assert (tmp_path / "run.nc").exists()
+
+
+def test_a_branch_that_cannot_begin_costs_none_that_is_done(monkeypatch, tmp_path, capsys):
+    """Values that look alike in six digits are told apart."""
+
+    def followed(scene, *_, **__):
+        if float(scene.belt_speed) > 1:
+            raise fj.NoLimitCycle("No limit cycle here.")
+        return xr.Dataset({"amplitude": ("point", np.ones(2))})
+
+    monkeypatch.setattr(fj, "continue_cycle", followed)
+    command = ["branch", "--over", "mu=0.2:0.25", "--mu", "0.227", "--each", "belt_speed=1:1.0000001:2"]
+    assert main([*command, "--out", str(tmp_path / "b")]) == 1
+    assert "belt_speed = 1.0000001: No limit cycle here." in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["b-1.nc"]

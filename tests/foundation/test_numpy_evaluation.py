@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -160,3 +161,22 @@ def test_parts_are_run_once_each_also_where_no_other_thread_is_free():
         in_threads(done.append, range(5), pool, 2)
         busy.set()
     assert sorted(done) == list(range(5))
+
+
+def test_where_one_thread_is_interrupted_the_others_have_ended_before_it_goes_on():
+    """They write into arrays of the thread that is interrupted."""
+    begun, written, caller = threading.Event(), [], threading.get_ident()
+
+    def run(part):
+        if threading.get_ident() == caller:
+            assert begun.wait(60)
+            raise KeyboardInterrupt
+        begun.set()
+        time.sleep(0.1)
+        written.append(part)
+
+    with ThreadPoolExecutor(1) as pool:
+        with pytest.raises(KeyboardInterrupt):
+            in_threads(run, range(9), pool, 2)
+        at_once = list(written)
+    assert at_once == written and len(written) == 1

@@ -152,7 +152,7 @@ def test_a_law_of_ones_own_comes_back_where_it_is_defined():
         fj.Scene.from_dataset(dataset)
 
 
-def test_what_cannot_be_saved_or_opened_is_refused(tmp_path):
+def test_what_cannot_be_saved_or_opened_is_refused(tmp_path, monkeypatch):
     (tmp_path / "text.nc").write_text("not a dataset")
     with refused(ValueError, "text.nc", "NetCDF"):
         fj.open(tmp_path / "text.nc")
@@ -161,11 +161,16 @@ def test_what_cannot_be_saved_or_opened_is_refused(tmp_path):
     for read in (fj.open, fj.read_matrices, lambda path: fj.read_recording(path.with_suffix(".csv"))):
         with pytest.raises(FileNotFoundError, match="does not exist"):
             read(tmp_path / "none.nc")
+    with refused(ValueError, "`path`", "NUL"):
+        fj.open("a\0.nc")
     with refused(TypeError, "`result`", "3 (int)"):
         fj.save(3, tmp_path / "three.nc")
     with refused(ValueError, "`dataset`", "scene"):
         fj.Scene.from_dataset(xr.Dataset())
     assert [path.name for path in tmp_path.iterdir()] == ["text.nc"]
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.R_OK)
+    with refused(ValueError, "text.nc", "protected against reading"):
+        fj.open(tmp_path / "text.nc")
 
 
 def test_nothing_on_disk_is_ever_half_written(run, tmp_path, monkeypatch):

@@ -180,6 +180,11 @@ def test_states_and_histories_are_refused_what_they_do_not_have():
         fj.smallest_kick(SCENE, over="history", bounds={"p": (1.0, 2.0)})
 
 
+def test_where_the_least_kick_of_the_bounds_squeals_it_is_the_smallest_and_none_below_it_is_proved():
+    found = fj.smallest_kick(SCENE, over=("p",), bounds={"p": (3.0, 4.0)})
+    assert found.p == found.proved_high == 3.0 and np.isnan(found.proved_low)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("over", ["state", "history"])
 def test_the_smallest_state_and_history_are_certified_to_more_than_half(over):

@@ -11,6 +11,7 @@ import fivjax as fj
 from fivjax.maps import engine, job_files, plan, store
 from fivjax.maps.checkpoint import BLOCK, Checkpoint
 from fivjax.maps.results import not_run
+from fivjax.maps.run_lock import LOCK
 from tests.helpers import stand_in_jobs
 
 AXES = {"mu": np.linspace(0.1, 0.2, 3), "p": np.linspace(1.0, 3.0, 4)}
@@ -49,7 +50,7 @@ def test_a_flipped_bit_is_never_a_result(paper_scene, tmp_path, jobs_run, kind):
     right, path = the_map(paper_scene), tmp_path / f"map.{kind}"
     the_map(paper_scene, path)
     files = [file for file in ([path] if kind == "part" else sorted(path.rglob("*"))) if file.is_file()]
-    files = [file for file in files if file.name != store.LOCK]
+    files = [file for file in files if file.name != LOCK]
     before = {file: file.read_bytes() for file in files}
     rng, refusals = random.Random(0), 0
     for _ in range(15):
@@ -77,11 +78,13 @@ def test_a_damaged_part_of_a_checkpoint_is_named_and_alone_is_computed_anew(pape
     first = Checkpoint(path, run, 3 * BLOCK, energy=False)
     first.keep(np.arange(3 * BLOCK), verdicts, {})
     first.flush()
+    first.close()
     at = path.read_bytes().find(np.arange(BLOCK, BLOCK + 4.0).tobytes())
     flipped(path, 8 * at)
     with pytest.warns(UserWarning, match=rf"`amplitude` of trajectories {BLOCK} to {2 * BLOCK - 1} is not what was"):
         again = Checkpoint(path, run, 3 * BLOCK, energy=False)
     assert np.flatnonzero(again.recall(None).pending()).tolist() == list(range(BLOCK, 2 * BLOCK))
+    again.close()
 
 
 def test_attractors_that_are_lost_are_found_again(paper_scene, tmp_path, jobs_run):

@@ -1,5 +1,6 @@
 """Sparse maps: the points that a refined map has computed, the parts of the grid made of them, and what is kept on the disk."""
 
+import contextlib
 import itertools
 import json
 import re
@@ -227,13 +228,19 @@ def test_damaged_results_of_a_sparse_map_count_as_not_run(tmp_path):
     for values in by_name(verdicts).values():
         values[:] = rng.integers(0, 2, len(places))
     kept = Checkpoint(path, {"of": 1}, None, False)
+
+    def recalled(path):
+        with contextlib.closing(Checkpoint(path, {"of": 1}, None, False)) as again:
+            return again.recall(places)
+
     for part in np.array_split(rng.permutation(len(places)), 3):
         part = np.sort(part)
         kept.keep(
             places[part], type(verdicts)(*(leaf if isinstance(leaf, dict) else leaf[part] for leaf in verdicts)), {}
         )
     kept.flush()
-    same = Checkpoint(path, {"of": 1}, None, False).recall(places)
+    kept.close()
+    same = recalled(path)
     for ours, theirs in zip(by_name(same).values(), by_name(verdicts).values(), strict=True):
         np.testing.assert_array_equal(ours, theirs)
     with xr.open_dataset(path, engine="h5netcdf") as dataset:
@@ -244,7 +251,7 @@ def test_damaged_results_of_a_sparse_map_count_as_not_run(tmp_path):
         damaged = tmp_path / "damaged.part"
         damaged.write_bytes(bytes(data))
         with pytest.warns(UserWarning, match="is damaged: the `(place|amplitude)` of trajectories 2048 to 3071"):
-            found = Checkpoint(damaged, {"of": 1}, None, False).recall(places)
+            found = recalled(damaged)
         lost = np.flatnonzero(found.pending())
         assert lost.tolist() == list(range(2048, 3072))
         whole = np.flatnonzero(~found.pending())

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 
 import numpy as np
 import pytest
@@ -110,17 +111,36 @@ def test_what_is_no_store_is_refused_and_left_alone(paper_scene, tmp_path, jobs_
     assert files(tmp_path) == before
 
 
-def test_a_second_writer_is_refused(paper_scene, tmp_path, jobs_run, monkeypatch):
-    """Two runs of one map would write the same chunks."""
-    path = tmp_path / "map.zarr"
+@pytest.mark.parametrize("name", ["map.zarr", "map.part"])
+def test_a_map_stays_where_it_was_begun_though_the_working_directory_changes(
+    paper_scene, tmp_path, jobs_run, monkeypatch, name
+):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    def moving(job, *_):
+        monkeypatch.chdir(tmp_path / "elsewhere")
+        return stand_in_jobs.run(job)
+
+    monkeypatch.setattr(engine, "run_job", moving)
+    fj.bistability_map(paper_scene, resume=name, progress=False, **AXES)
+    assert {entry.name for entry in tmp_path.iterdir()} == {"elsewhere", name}
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+@pytest.mark.parametrize("name", ["map.zarr", "map.part"])
+def test_a_second_writer_is_refused(paper_scene, tmp_path, jobs_run, monkeypatch, name):
+    """Two runs of one map would write the same chunks, or each a file without what the other has done."""
+    path = tmp_path / name
 
     def second(job, *_):
-        with pytest.raises(ValueError, match="being written by another process"):
+        with pytest.raises(ValueError, match=rf"{name}` is being written by another process, number {os.getpid()} on"):
             fj.bistability_map(paper_scene, resume=path, progress=False, **AXES)
         return stand_in_jobs.run(job)
 
     monkeypatch.setattr(engine, "run_job", second)
     fj.bistability_map(paper_scene, resume=path, progress=False, **AXES)
+    assert [entry.name for entry in tmp_path.iterdir()] == [name]
 
 
 def test_a_full_disk_is_said_of_the_store_and_what_it_holds_stays(paper_scene, tmp_path, jobs_run, monkeypatch):

@@ -226,6 +226,8 @@ def test_missing_widgets_are_named(scene, monkeypatch):
 def test_wrong_arguments_are_refused(scene, a_map):
     with pytest.raises(ValueError, match="must name parameters of the scene"):
         fj.explorer(scene, ranges={"stiffness": (0, 1)})
+    with pytest.raises(ValueError, match="map over parameters of the scene, but `x2` is none"):
+        fj.explorer(scene, a_map.rename(mu="x2"))
     with pytest.raises(ValueError, match="two axes"):
         fj.explorer(scene, a_map.isel(mu=0, drop=True))
     with pytest.raises(TypeError, match="a map"):

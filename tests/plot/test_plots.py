@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +14,20 @@ import fivjax as fj
 from fivjax import plot
 from fivjax.maps.axes import linear_limit
 from fivjax.plot.contact_status import KICK_HEIGHT
+from fivjax.plot.cycles import _section as draw_section
 from fivjax.plot.style import coordinate_label
 from tests.helpers.general_coordinates import TURN, in_general_coordinates
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.3, start=0.02))
+
+TWO = fj.Structure(
+    np.eye(4),
+    np.eye(4),
+    1e4 * np.eye(4),
+    [0.0, -1.0, 0.0, -1.0],
+    contacts=[fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)],
+)
+ONE_AND_TWO_CONTACTS = fj.belt_oscillator(), TWO
 
 
 @pytest.fixture(scope="module")
@@ -337,3 +348,12 @@ def test_runs_of_a_contact_given_by_vectors_are_drawn_along_its_belt():
     for figure in (fj.show(run), fj.plot.response(run), fj.plot.comparison({"a": run})):
         np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), expected)
     np.testing.assert_allclose(fj.plot.perturbation(run).axes[1].lines[0].get_ydata(), expected)
+
+
+@pytest.mark.parametrize("structure", [in_general_coordinates(fj.belt_oscillator()), *ONE_AND_TWO_CONTACTS])
+def test_the_points_of_a_torus_are_drawn_along_the_belt_of_the_contact_shown(structure):
+    points = np.random.default_rng(0).normal(size=(5, 2 * structure.size))
+    axes, contact = Figure().subplots(), len(structure.contacts) - 1
+    draw_section(axes, SimpleNamespace(scene=SimpleNamespace(structure=structure), points=points), contact)
+    expected = 1e3 * points[:, : structure.size] @ structure.tangential_directions[:, contact]
+    np.testing.assert_array_equal(axes.lines[0].get_xdata(), expected)
