@@ -251,7 +251,6 @@ def test_next_to_the_unstable_cycle_of_a_locked_torus_motions_are_captured_for_t
     assert m["verdict"].values.tolist() == [fj.Verdict.LIMIT_CYCLE] and m["proof"].values.tolist() == [
         fj.Proof.APPROACH
     ]
-    cycle = fj.limit_cycle(scene)
-    np.testing.assert_allclose(
-        [m["attractor_period"][0], m["amplitude"][0]], [cycle.period, cycle.amplitude], rtol=1e-7
-    )
+    found = m["attractor_period"].item(), m["amplitude"].item()
+    # Another cycle attracts others.
+    assert any(found == pytest.approx((cycle.period, cycle.amplitude), rel=1e-7) for cycle in fj.limit_cycles(scene))
