@@ -43,17 +43,17 @@ class BranchPoint(NamedTuple):
 
 def branch_point(family: Family, curve: Curve, cycle: ComputedCycle, special: Special | None = None) -> BranchPoint:
     """A point of the branch from a computed cycle, with the real motion that starts on it."""
-    real = real_motion(family.at(cycle.parameter), family.stepper, cycle.phases)
+    real = real_motion(family.at(cycle.parameter), cycle.phases)
     return BranchPoint(curve, cycle, real, multipliers_of(cycle.images), special)
 
 
 def point_through(family: Family, parameter: float, start: SectionPoint, period: float) -> BranchPoint | None:
     """The point of a branch that is the cycle through a state; None at a special point, where its equations are singular."""
     scene = family.at(parameter)
-    segments = follow_period(scene, family.stepper, start, period).segments
+    segments = follow_period(scene, start, period).segments
     if np.any(segments.ended):
         # The point on the section may be where an event ends: a landing can make the tangential velocity jump through zero.
-        segments = follow_period(scene, family.stepper, middle_of_longest(segments), period).segments
+        segments = follow_period(scene, middle_of_longest(segments), period).segments
     phases = phases_around(segments)
     if phases is None:
         return None
@@ -67,7 +67,7 @@ def cycle_beyond(family: Family, last: BranchPoint, at: float, sense: float) -> 
     the section: there may be many changes of modes in between, as where a chain of rebounds ends no longer.
     """
     phases, scene = last.cycle.phases, family.at(last.cycle.parameter)
-    start = None if last.real is None else on_section(scene, family.stepper, phases, last.real)
+    start = None if last.real is None else on_section(scene, phases, last.real)
     crossings = None if start is None else crossings_of(ReturnMaps.of(scene), start)
     if start is None or crossings is None:
         return None
@@ -90,7 +90,7 @@ def _are_alike(one: BranchPoint, other: BranchPoint, share: float) -> bool:
 
 def is_real_motion(family: Family, cycle: ComputedCycle) -> bool:
     """Whether the real motion has the modes and events of a computed cycle."""
-    return _moves_as_computed(real_motion(family.at(cycle.parameter), family.stepper, cycle.phases), cycle)
+    return _moves_as_computed(real_motion(family.at(cycle.parameter), cycle.phases), cycle)
 
 
 def _moves_as_computed(real: RealMotion | None, cycle: ComputedCycle) -> bool:

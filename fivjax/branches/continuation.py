@@ -32,7 +32,6 @@ from ..section.about_sliding import sliding_state
 from ..section.crossings import Point as SectionPoint
 from ..section.return_maps import ReturnMaps
 from ..simulation.start import snapped_to_belt
-from ..steppers.event_exact import EventExact
 from .branch_points import BranchPoint, point_through
 from .following import HalfBranch, follow_branch
 from .multiple_shooting import Mode, Phases
@@ -122,7 +121,7 @@ def continue_cycle(
         )
     arguments.whole_number("points", points, minimum=2)
     arguments.truth("derivatives", derivatives)
-    cycle = limit_cycle(final) if start is None else limit_cycle(final, start)
+    cycle = limit_cycle(final, start)
     if cycle.kind != "periodic" and start is None:
         # Past a fold, the branch of the saddle cycle leads to the unstable cycle inside the torus. Where sliding is unstable
         # there is no saddle cycle.
@@ -133,7 +132,7 @@ def continue_cycle(
             f"The motion to start from, at {parameter} = {value:g}, is a torus, which is not continued. Start where the limit "
             f"cycle is periodic, or give a `LimitCycle` as `start`."
         )
-    family = Family(final, direction_of(final, parameter), parameter, value, high - low, EventExact())
+    family = Family(final, direction_of(final, parameter), parameter, value, high - low)
     first = point_through(family, value, point_of(cycle), cycle.period)
     if first is None:
         raise NoLimitCycle(
@@ -234,11 +233,11 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
         scene = family.at(point.cycle.parameter)
         slides.append(bool(sliding_rates(scene)[0].real < 0))
         rest = sliding_state(scene, scene.load.final)
-        at = None if point.real is None else on_section(scene, family.stepper, point.cycle.phases, point.real)
+        at = None if point.real is None else on_section(scene, point.cycle.phases, point.real)
         states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
         status.append(np.full(none, -1) if at is None else at.contact.status)
         direction.append(np.full(none, np.nan) if at is None else at.contact.direction)
-        peaks.append(np.nan if point.real is None else amplitude(scene, family.stepper, point.cycle.phases, point.real))
+        peaks.append(np.nan if point.real is None else amplitude(scene, point.cycle.phases, point.real))
         if point.name == MEETS_SLIDING:
             states[-1], peaks[-1] = rest, 0.0
     multipliers = np.stack([point.multipliers for point in points])

@@ -66,7 +66,7 @@ class Grazing(NamedTuple):
 def guard_minima(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
     """All minima of guards in the phases of a cycle, the lowest first."""
     family, phases = curve.family, cycle.phases
-    looked = inside(family.at(cycle.parameter), family.stepper, phases)
+    looked = inside(family.at(cycle.parameter), phases)
     found = _static_edges(curve, cycle)
     for k, mode in enumerate(phases.modes):
         step = phases.h[k] / (looked.guards.shape[1] - 1)
@@ -125,7 +125,7 @@ def _static_edges(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
     if not places:
         return []
     none = np.zeros(len(places))
-    margins = images_of_phases(scene, family.direction, family.stepper, modes, modes, phases.y[places], none).guard
+    margins = images_of_phases(scene, family.direction, modes, modes, phases.y[places], none).guard
     width = np.repeat(np.abs(margins[::2] + margins[1::2]), 2)
     shares = np.divide(margins, width, out=np.full_like(margins, np.inf), where=width > 0)
     return [GuardMinimum(k, mode, 0.0, float(share), 0.0) for k, mode, share in zip(places, modes, shares, strict=True)]
@@ -136,7 +136,7 @@ def images_up_to_minimum(
 ) -> tuple[PhaseImages, PhaseImages]:
     """Images of all phases, and of the phase with the minimum up to its instant."""
     family = curve.family
-    found = images_of_phases(family.at(parameter), family.direction, family.stepper, *up_to_minimum(phases, minimum))
+    found = images_of_phases(family.at(parameter), family.direction, *up_to_minimum(phases, minimum))
     return without_minimum(found)
 
 

@@ -117,7 +117,7 @@ def _inserted(bracket: _Bracket, ahead: ComputedCycle):
         cycle = curve.along(ahead, tangent, share * step)
         if cycle is None:
             continue
-        real = real_motion(family.at(cycle.parameter), family.stepper, cycle.phases)
+        real = real_motion(family.at(cycle.parameter), cycle.phases)
         if real is None or real.phases is None or not len(curve.modes) < len(real.phases.modes) <= MOST_PHASES:
             continue
         change = change_between(real.phases.modes, curve.modes)
@@ -194,7 +194,6 @@ def _reordered(family: Family, curve: Curve, valid: ComputedCycle, phase: int):
     ends = images_of_phases(
         family.at(cycle.parameter),
         family.direction,
-        family.stepper,
         [modes[phase - 1]],
         [modes[phase]],
         cycle.phases.y[[phase - 1]],
@@ -232,8 +231,8 @@ def _shorter(family: Family, valid: ComputedCycle, phase: int):
         # The remaining phase has no event: it starts and ends on the section.
         kept = (after._replace(ending=AT_SECTION),)
         change = change_between(modes, kept)
-        real = real_motion(family.at(valid.parameter), family.stepper, phases)
-        point = None if real is None else on_section(family.at(valid.parameter), family.stepper, phases, real)
+        real = real_motion(family.at(valid.parameter), phases)
+        point = None if real is None else on_section(family.at(valid.parameter), phases, real)
         if change is None or point is None:
             return None
         return Phases(kept, np.asarray(point.y)[None], np.array([phases.period])), change

@@ -27,8 +27,7 @@ from ..foundation.compiling import power_of_4
 from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import ByMethod
-from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.kernel_scope import has_kernel
 from ..steppers.section import section_speed
 
@@ -175,9 +174,9 @@ def same_modes(a: tuple, b: tuple) -> bool:
     return len(a) == len(b) and any(a == b[k:] + b[:k] for k in range(len(b)))
 
 
-def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) -> PhaseImages:
+def images(scene: Scene, direction: Scene, phases: Phases) -> PhaseImages:
     """Images of all phases, and their derivatives by state and duration and along a direction of the parameters."""
-    return images_of_phases(scene, direction, stepper, *one_after_another(phases))
+    return images_of_phases(scene, direction, *one_after_another(phases))
 
 
 def one_after_another(phases: Phases):
@@ -185,28 +184,26 @@ def one_after_another(phases: Phases):
     return phases.modes, phases.modes[1:] + phases.modes[:1], phases.y, phases.h
 
 
-def images_of_phases(scene: Scene, direction: Scene, stepper: EventExact, modes, following, y, h) -> PhaseImages:
+def images_of_phases(scene: Scene, direction: Scene, modes, following, y, h) -> PhaseImages:
     """`images` of single phases, each with the mode that follows it."""
-    (found,) = images_along(scene, [direction], stepper, modes, following, y, h)
+    (found,) = images_along(scene, [direction], modes, following, y, h)
     return found
 
 
-def images_along(
-    scene: Scene, directions: Sequence[Scene], stepper: EventExact, modes, following, y, h
-) -> list[PhaseImages]:
+def images_along(scene: Scene, directions: Sequence[Scene], modes, following, y, h) -> list[PhaseImages]:
     """The same along each of several directions of the parameters, by one kernel for all of them."""
-    by_kernel, count = has_kernel(scene, stepper), len(modes)
+    by_kernel, count = has_kernel(scene, EXACT_STEPPER), len(modes)
     ends = Ends(_contacts(modes), np.array([mode.ending for mode in modes], np.int32), _contacts(following))
     own = _filled((np.asarray(y, float), np.asarray(h, float), ends), by_kernel)
     size = own[0].shape[1]
     # Directions of the derivatives: those of the state, the duration, the parameters.
     total = size + 1 + len(directions)
-    args, units = (ByMethod(stepper), scene), np.eye(total)
-    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), total)), (*args, *_first(own)))
+    units = np.eye(total)
+    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), total)), _first(own))
     none = jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)), directions[0])
     of_parameters = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *[none] * (size + 1), *directions)
-    along = still[0], of_parameters, units[:size], units[size], still[4]
-    found = _image.derived(args, along, own=own, by_kernel=by_kernel)
+    along = of_parameters, units[:size], units[size], still[2]
+    found = _image.derived((scene,), along, own=own, by_kernel=by_kernel)
     ((y, guard), _), ((to, of_guard), _) = found
 
     def of_one(column: int) -> PhaseImages:
@@ -245,13 +242,14 @@ def _first(own):
 
 
 def _image_of_phase(args, numbers):
-    how, scene, y, h, ends = args
+    scene, y, h, ends = args
     del numbers
     mechanics = mechanics_about_sliding(scene)
-    stepper = for_derivatives(how.method)
     contact, none = ends.contact, jnp.zeros((), y.dtype)
     begin = physics.on_constraint(mechanics, contact, y)
-    end = physics.on_constraint(mechanics, contact, stepper.in_one_mode(mechanics, contact, begin, h))
+    end = physics.on_constraint(
+        mechanics, contact, for_derivatives(EXACT_STEPPER).in_one_mode(mechanics, contact, begin, h)
+    )
     guards = physics.guards(mechanics, contact, none, end)
     ended = (jnp.arange(guards.size) == ends.ending).reshape(guards.shape)
     guard = jnp.sum(jnp.where(ended, guards, 0.0))
@@ -274,25 +272,25 @@ class Inside(NamedTuple):
     states: Float[np.ndarray, "k look state"]
 
 
-def inside(scene: Scene, stepper: EventExact, phases: Phases) -> Inside:
+def inside(scene: Scene, phases: Phases) -> Inside:
     """Guards and states along all phases, including both ends of each."""
-    by_kernel = has_kernel(scene, stepper)
+    by_kernel = has_kernel(scene, EXACT_STEPPER)
     own = _filled((phases.y, phases.h, _contacts(phases.modes)), by_kernel)
-    _, rows = _looks((ByMethod(stepper), scene), np.linspace(0.0, 1.0, LOOKS + 1), own=own, by_kernel=by_kernel)
+    _, rows = _looks((scene,), np.linspace(0.0, 1.0, LOOKS + 1), own=own, by_kernel=by_kernel)
     return Inside(*(part[: len(phases.modes)] for part in rows))
 
 
 def _inside_of_phase(args, shares):
-    how, scene, y, h, contact = args
+    scene, y, h, contact = args
     mechanics, none = mechanics_about_sliding(scene), jnp.zeros((), y.dtype)
 
     def to_next(before, share):
         y, gone = before
-        y = how.method.in_one_mode(mechanics, contact, y, (share - gone) * h)
+        y = EXACT_STEPPER.in_one_mode(mechanics, contact, y, (share - gone) * h)
         return (y, share), Inside(physics.guards(mechanics, contact, none, y).reshape(-1), y)
 
     return (), jax.lax.scan(to_next, depending_on(mechanics, (y, none)), shares)[1]
 
 
-# Of (how, scene, y, h, ends), and of (how, scene, y, h, contact).
+# Of (scene, y, h, ends), and of (scene, y, h, contact).
 _image, _looks = KernelFunction(_image_of_phase), KernelFunction(_inside_of_phase)

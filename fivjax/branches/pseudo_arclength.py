@@ -14,7 +14,6 @@ from ..contact import Status
 from ..model.directions import moved_along
 from ..model.scene import Scene
 from ..section.about_sliding import weights_of
-from ..steppers.event_exact import EventExact
 from .multiple_shooting import AT_SECTION, Mode, PhaseImages, Phases, images
 
 
@@ -26,7 +25,6 @@ class Family(NamedTuple):
     name: str
     value: float  # of the parameter in `scene`
     scale: float  # a large change of the parameter
-    stepper: EventExact
 
     def at(self, parameter: float) -> Scene:
         """The scene with this value of the parameter."""
@@ -70,7 +68,7 @@ class Curve:
         """Residuals and their derivatives, each equation scaled by the size of its derivatives."""
         phases, parameter = self.phases(u)
         family = self.family
-        found = images(family.at(parameter), family.direction, family.stepper, phases)
+        found = images(family.at(parameter), family.direction, phases)
         residuals, rows = assembled(found, phases)
         rows = rows * self.scales
         sizes = np.max(np.abs(rows), axis=1)

@@ -49,7 +49,7 @@ def _derivatives(family: Family, special: Special, names: list[str]) -> list[flo
         asked = up_to_minimum(phases, minimum)
         _, partial = images_up_to_minimum(special.curve, cycle.parameter, phases, minimum)
         row = row_of(special.curve, phases, minimum, partial)
-    found = images_along(family.at(cycle.parameter), directions, family.stepper, *asked)
+    found = images_along(family.at(cycle.parameter), directions, *asked)
     return [_derivative(family, special, row, *each) for each in zip(names, directions, found, strict=True)]
 
 

@@ -11,7 +11,6 @@ from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
-from ..steppers.event_exact import EventExact
 from .multiple_shooting import AT_SECTION, LOOKS, Inside, Phases, inside, phases_around
 
 # A motion on the cycle returns to its start within this share of its size.
@@ -30,7 +29,7 @@ class RealMotion(NamedTuple):
         return self.phases is not None and self.phases.has_the_modes_of(computed)
 
 
-def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> RealMotion | None:
+def real_motion(scene: Scene, phases: Phases) -> RealMotion | None:
     """One period of the real motion from a computed cycle; None if a computed phase has a negative duration."""
     # At a special point the duration of a vanishing phase is zero up to rounding.
     if not (np.all(np.isfinite(phases.y)) and np.all(phases.h > -1e-9 * phases.period)):
@@ -41,13 +40,13 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> RealMotion
     start = (
         Point(phases.y[longest], phases.modes[longest].contact)
         if whole
-        else _states(scene, stepper, phases, [LOOKS // 2])[longest]
+        else _states(scene, phases, [LOOKS // 2])[longest]
     )
-    seen = follow_period(scene, stepper, start, phases.period)
+    seen = follow_period(scene, start, phases.period)
     return RealMotion(start, seen, phases_around(seen.segments))
 
 
-def amplitude(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotion) -> float:
+def amplitude(scene: Scene, phases: Phases, real: RealMotion) -> float:
     """The peak tangential speed (m/s) of a cycle: of its real motion; unless rounding makes that touch again and again where
     the cycle grazes, so that it comes to no end, or go another way where that is about to change. Then of the computed phases.
     """
@@ -57,7 +56,7 @@ def amplitude(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotio
     places = scene.structure.size + np.atleast_1d(tangential)
     # Looks at all phases, then twice finer ones about the highest speed: a parabola through three of them is then exact.
     for _ in range(3):
-        states = inside(scene, stepper, phases).states
+        states = inside(scene, phases).states
         speeds = np.abs(states[:, :, places])
         k, look, contact = np.unravel_index(np.argmax(speeds), speeds.shape)
         look, step = int(np.clip(look, 1, LOOKS - 1)), phases.h[k] / LOOKS
@@ -70,14 +69,14 @@ def amplitude(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotio
     return float(at if bend == 0 else at - (after - before) ** 2 / (8 * bend))
 
 
-def on_section(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotion) -> Point | None:
+def on_section(scene: Scene, phases: Phases, real: RealMotion) -> Point | None:
     """The first crossing of the section on a computed cycle; None if there is none."""
     if phases.modes[0].ending == AT_SECTION:
         return real.start
     # Where the real motion goes another way, from just before the section.
     maps = ReturnMaps.of(scene)
-    starts = [real.start] if real.moves_as(phases) else _before_section(maps, inside(scene, stepper, phases), phases)
-    return _reached(maps, starts) or _reached(maps, _states(scene, stepper, phases, range(1, LOOKS)))
+    starts = [real.start] if real.moves_as(phases) else _before_section(maps, inside(scene, phases), phases)
+    return _reached(maps, starts) or _reached(maps, _states(scene, phases, range(1, LOOKS)))
 
 
 def _before_section(maps: ReturnMaps, looked: Inside, phases: Phases) -> list[Point]:
@@ -96,9 +95,9 @@ def _reached(maps: ReturnMaps, starts: list[Point]) -> Point | None:
     return found.point(int(reached[0])) if len(reached) else None
 
 
-def _states(scene: Scene, stepper: EventExact, phases: Phases, looks: Iterable[int]) -> list[Point]:
+def _states(scene: Scene, phases: Phases, looks: Iterable[int]) -> list[Point]:
     """The states at these instants, of `LOOKS`, of all phases."""
-    states = inside(scene, stepper, phases).states
+    states = inside(scene, phases).states
     return [Point(y, mode.contact) for look in looks for mode, y in zip(phases.modes, states[:, look], strict=True)]
 
 

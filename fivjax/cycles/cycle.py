@@ -18,7 +18,6 @@ from ..section.about_sliding import sliding_state
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 from ..simulation.trajectory import Trajectory, simulate
-from ..steppers.event_exact import EventExact
 from .one_period import Phase, floquet_multipliers, follow_period, word
 
 if TYPE_CHECKING:
@@ -251,8 +250,8 @@ def section_multipliers(jacobian: Float[np.ndarray, "state state"]) -> Complex[n
 @in_double_precision
 def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitCycle:
     """The limit cycle of a fixed point of the scene's return map."""
-    point, stepper = closed.point, EventExact()
-    seen = follow_period(scene, stepper, point, closed.period)
+    point = closed.point
+    seen = follow_period(scene, point, closed.period)
     largest = np.abs(section_multipliers(closed.jacobian))[0]
     points = np.asarray(point.y)[None]
     if closed.crossings > 1:
@@ -265,7 +264,7 @@ def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitC
         state=np.asarray(point.y) + _equilibrium(scene),
         contact=Contact(np.asarray(point.contact.status), np.asarray(point.contact.direction)),
         word=word(seen.segments),
-        multipliers=floquet_multipliers(scene, stepper, seen.segments, closed.period),
+        multipliers=floquet_multipliers(scene, seen.segments, closed.period),
         stable=bool(largest < 1 - (MARGIN if np.ndim(point.contact.status) == 0 else FAMILY_TOLERANCE)),
         amplitude=float(seen.amplitude),
         residual=closed.residual,

@@ -25,9 +25,9 @@ from ..model.printing import as_call
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import sliding_state
-from ..section.crossings import ByMethod, Point, motion_to_section
+from ..section.crossings import Point, motion_to_section
 from ..section.free_directions import jumped_to, section_row, zero_on_section
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EXACT_STEPPER
 from ..steppers.kernel_scope import has_kernel
 from .cycle import LimitCycle, point_of, under_final_load
 from .own_coordinates import in_own_coordinates
@@ -214,13 +214,13 @@ def _image(scene: Scene, contact: Contact, crossings):
     """The return map with period and peak, as a function of the state on the section; its further result is the contact mode
     there, and whether the section was reached.
     """
-    how, numbers = ByMethod(EventExact()), jnp.asarray(crossings, jnp.float64)[None]
+    numbers = jnp.asarray(crossings, jnp.float64)[None]
 
     def image(y):
         (at, _, arrived, peak), _ = motion_to_section(
-            (how, scene, Point(y, contact), crossings, math.inf, np.True_),
+            (scene, Point(y, contact), crossings, math.inf, np.True_),
             numbers,
-            by_kernel=has_kernel(scene, how.method),
+            by_kernel=has_kernel(scene, EXACT_STEPPER),
         )
         return _Image(at.point.y, at.time, jnp.where(arrived, peak, jnp.nan)), (at.point.contact, arrived)
 

@@ -18,10 +18,10 @@ from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import MOST_SEGMENTS, ByMethod, Point, motion_to_section
+from ..section.crossings import MOST_SEGMENTS, Point, motion_to_section
 from ..section.peak_speed import higher_peak
 from ..section.return_maps import known_for_section
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EXACT_STEPPER
 from ..steppers.kernel_scope import has_kernel
 
 HARMONICS = 16
@@ -66,14 +66,14 @@ class _Carry(NamedTuple):
 
 def _around(args, numbers):
     """The end of a motion from a point on a cycle over one period; and its segments with these numbers, from 0 onwards."""
-    how, scene, point, period = args
+    scene, point, period = args
     mechanics, zero = mechanics_about_sliding(scene), jnp.zeros((), point.y.dtype)
     contact = Contact(point.contact.status.astype(jnp.int32), point.contact.direction)
     begin = _Carry(point.y, contact, period, zero, jnp.zeros((), jnp.int32))
     begin = depending_on(mechanics, begin)
 
     def segment(way: _Carry, number):
-        after, series, unit = how.method.with_series(mechanics, way.contact, zero, way.y, way.left)
+        after, series, unit = EXACT_STEPPER.with_series(mechanics, way.contact, zero, way.y, way.left)
         goes = (way.left > 0) & (way.count == number)
         peak = higher_peak(mechanics, series, after.h, after.h / unit, way.peak)
         moved = _Carry(
@@ -89,14 +89,14 @@ def _around(args, numbers):
 _period = KernelFunction(_around)
 
 
-def follow_period(scene: Scene, stepper: EventExact, point: Point, period: float) -> PeriodSummary:
+def follow_period(scene: Scene, point: Point, period: float) -> PeriodSummary:
     """Segments, peak tangential speed and harmonics of one period from a point on it."""
     # Rows for the segments of a period at first; more where they are not enough.
     least_segments = 64
-    args = ByMethod(stepper), scene, jax.tree.map(known_to_numpy, point), float(period)
+    args = scene, jax.tree.map(known_to_numpy, point), float(period)
     most = least_segments
     while True:
-        end, rows = _period(args, np.arange(float(most)), by_kernel=has_kernel(scene, stepper))
+        end, rows = _period(args, np.arange(float(most)), by_kernel=has_kernel(scene, EXACT_STEPPER))
         if end.count < most or most > MOST_SEGMENTS or not np.all(np.isfinite(end.y)):
             break
         most *= 4
@@ -147,16 +147,14 @@ def word(segments: PeriodSegments) -> tuple[Phase, ...]:
     )
 
 
-def floquet_multipliers(
-    scene: Scene, stepper: EventExact, segments: PeriodSegments, period: float
-) -> Complex[np.ndarray, " m"]:
+def floquet_multipliers(scene: Scene, segments: PeriodSegments, period: float) -> Complex[np.ndarray, " m"]:
     """Eigenvalues of the monodromy matrix, largest first: one is 1, for the direction along the cycle.
 
     The matrix is computed in the coordinates that the contact mode leaves free: sticking leaves fewer free, so that multipliers
     of 0 would be missing.
     """
     start = middle_of_longest(segments)
-    matrix = _monodromy(scene, stepper, start, period)
+    matrix = _monodromy(scene, start, period)
     free = free_in_mode(scene, start.contact.status)
     values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
     return values[np.argsort(-np.abs(values), kind="stable")]
@@ -171,11 +169,11 @@ def middle_of_longest(segments: PeriodSegments) -> Point:
     return Point(middle, jax.tree.map(lambda leaf: leaf[longest], segments.contact))
 
 
-def _monodromy(scene: Scene, stepper: EventExact, start: Point, period: float) -> Float[np.ndarray, "state state"]:
+def _monodromy(scene: Scene, start: Point, period: float) -> Float[np.ndarray, "state state"]:
     """The derivative of the state a period (s) later by that at the start."""
     whose, last = known_for_section(scene), np.array([float(NEVER)])
-    args = ByMethod(stepper), whose, start, NEVER, period, np.False_
-    by_kernel = has_kernel(scene, stepper)
+    args = whose, start, NEVER, period, np.False_
+    by_kernel = has_kernel(scene, EXACT_STEPPER)
     _, (slopes, _) = motion_to_section.derived_by(args, start.y, np.eye(len(start.y)), last, by_kernel=by_kernel)
     return slopes.at.point.y
 

@@ -20,7 +20,6 @@ from ..contact import Contact
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
 from ..section.return_maps import ReturnMaps, section_at
-from ..steppers.event_exact import EventExact
 from .cycle import LimitCycle, under_final_load
 from .one_period import follow_period, word
 
@@ -37,7 +36,7 @@ def limit_cycle_of_torus(maps: ReturnMaps, scene: Scene, torus: Torus) -> LimitC
     points, rotation, residual = _curve(weights, found.path[0])
     exponents = _lyapunov_exponents(maps, found.path[0])
     point = start.point(0)
-    seen = follow_period(scene, EventExact(), point, float(maps.returns(only, start, WINDOW).time[0]))
+    seen = follow_period(scene, point, float(maps.returns(only, start, WINDOW).time[0]))
     largest = np.exp(exponents).astype(complex)
     return LimitCycle(
         scene=under_final_load(scene),

@@ -21,7 +21,6 @@ from ..model.directions import directions_of
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state, weights_of
-from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
 from .critical import critical_perturbation
 from .response import MOST_CROSSINGS, Crossings, kicked
@@ -97,10 +96,7 @@ def boundary_section(
     stable, unstable = np.meshgrid(axis, axis, indexing="ij")
     verdict = verdicts(stable, unstable)
     along_p = directions_of(scene, ("p",))
-    sides = [
-        kicked(scene.replace(p=critical.p * (1 + by)), EventExact(), along_p, MOST_CROSSINGS)
-        for by in (-beside, beside)
-    ]
+    sides = [kicked(scene.replace(p=critical.p * (1 + by)), along_p, MOST_CROSSINGS) for by in (-beside, beside)]
     paths = [_path(side, weights, origin, left / size, right * size) for side in sides]
     longest = max(map(len, paths))
     padded = [np.pad(path, ((0, longest - len(path)), (0, 0)), constant_values=np.nan) for path in paths]

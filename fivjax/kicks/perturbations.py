@@ -19,9 +19,9 @@ from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates, sliding_states
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import MOST_SEGMENTS, ByMethod
+from ..section.crossings import MOST_SEGMENTS
 from ..steppers.core import follow
-from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.kernel_scope import has_kernel
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 
@@ -165,9 +165,8 @@ class Histories:
     def __init__(self, scene: Scene, pieces: int, time: float):
         self.scene, self.pieces, self.time = scene, pieces, time
         self.sliding = stable_sliding(scene)
-        stepper = EventExact()
-        self.by_kernel = has_kernel(scene, stepper)
-        self.given = ByMethod(for_derivatives(stepper)), scene, np.asarray(float(time))
+        self.by_kernel = has_kernel(scene, EXACT_STEPPER)
+        self.given = scene, np.asarray(float(time))
 
     def norm(self, u: Vectors) -> Float[np.ndarray, " k"]:
         return np.max(np.abs(u), axis=-1)
@@ -272,19 +271,21 @@ def _highest(sizes: np.ndarray) -> list[int]:
 
 def _at_end(args, _):
     """The state after a history of the load that began in steady sliding."""
-    how, scene, time, factors = args
+    scene, time, factors = args
     mechanics, n = mechanics_about_sliding(scene), scene.structure.size
 
     def piece(carry, factor):
         y, contact = carry
         # Loads are deviations from the final load.
         more, part = factor * scene.load.final, time / len(factors)
-        after = follow(how.method, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
+        after = follow(
+            for_derivatives(EXACT_STEPPER), mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax"
+        )
         return (after.y, after.contact), None
 
     sliding = Contact.sliding(jnp.sign(mechanics.belt_speed))
     return jax.lax.scan(piece, (jnp.zeros(2 * n), sliding), factors)[0][0], ()
 
 
-# Of (how, scene, time in s, factors on the load).
+# Of (scene, time in s, factors on the load).
 _after_history = KernelFunction(_at_end)

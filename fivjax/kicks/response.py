@@ -16,8 +16,8 @@ from ..model.load import Pulse
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import longest_return, mechanics_about_sliding
-from ..section.crossings import ByMethod, Kick, Point, to_crossing
-from ..steppers.event_exact import EventExact, for_derivatives
+from ..section.crossings import Kick, Point, to_crossing
+from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.kernel_scope import has_kernel
 
 # The most crossings of the section that are kept.
@@ -35,42 +35,38 @@ class Crossings(NamedTuple):
     count: int
 
 
-def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:
+def kicked(scene: Scene, directions: Scene, crossings: int) -> Crossings:
     """Crossings after the kick of the scene's load, from steady sliding; as many as asked for, if there are so many."""
     each = np.shape(contact_coordinates(scene.structure)[0])
     direction = np.broadcast_to(np.sign(np.asarray(scene.belt_speed, float)), each)
     start = Point(np.zeros(2 * scene.structure.size), Contact.sliding(direction))
-    return _followed(scene, stepper, directions, start, None, crossings)
+    return _followed(scene, directions, start, None, crossings)
 
 
-def returned(scene: Scene, stepper: EventExact, directions: Scene, point: Point, crossings: int) -> Crossings:
+def returned(scene: Scene, directions: Scene, point: Point, crossings: int) -> Crossings:
     """Crossings of the motion from a point of the section, without a kick."""
     quiet = scene.replace(p=1.0, duration=0.0)
-    return _followed(quiet, stepper, directions, point, None, crossings)
+    return _followed(quiet, directions, point, None, crossings)
 
 
-def started(
-    scene: Scene, stepper: EventExact, start: Point, directions: Float[np.ndarray, "d state"], crossings: int
-) -> Crossings:
+def started(scene: Scene, start: Point, directions: Float[np.ndarray, "d state"], crossings: int) -> Crossings:
     """Crossings of the motion from any state, without a kick, with derivatives along directions of that state."""
     quiet = scene.replace(p=1.0, duration=0.0)
     fixed = jax.tree.map(lambda leaf: np.zeros((len(directions), *np.shape(leaf))), quiet)
-    return _followed(quiet, stepper, fixed, start, directions, crossings)
+    return _followed(quiet, fixed, start, directions, crossings)
 
 
-def _followed(
-    scene: Scene, stepper: EventExact, directions: Scene, start: Point, of_start, crossings: int
-) -> Crossings:
-    by_kernel, wanted = has_kernel(scene, stepper), crossings
+def _followed(scene: Scene, directions: Scene, start: Point, of_start, crossings: int) -> Crossings:
+    by_kernel, wanted = has_kernel(scene, EXACT_STEPPER), crossings
     if not by_kernel:
         # XLA compiles a program for each number of rows.
         wanted = MOST_CROSSINGS
-    args = ByMethod(stepper), scene, jax.tree.map(known_to_numpy, start), np.int32(crossings)
+    args = scene, jax.tree.map(known_to_numpy, start), np.int32(crossings)
     along = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf, float), 0, -1), directions)
     still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), _count(directions))), args)
-    moving = still[0], along, still[2], still[3]
+    moving = along, still[1], still[2]
     if of_start is not None:
-        moving = eqx.tree_at(lambda args: args[2].y, moving, of_start.T)
+        moving = eqx.tree_at(lambda args: args[1].y, moving, of_start.T)
     (end, rows), (_, slopes) = _motion_after_kick.derived(args, moving, np.arange(1.0, wanted + 1), by_kernel=by_kernel)
     at, contact = rows.point, rows.point.contact
     return Crossings(
@@ -82,8 +78,8 @@ def _count(directions) -> int:
     return len(jax.tree.leaves(directions)[0])
 
 
-def _after_kick(args, numbers, adapted=lambda method: method):
-    how, scene, start, crossings = args
+def _after_kick(args, numbers, method=EXACT_STEPPER):
+    scene, start, crossings = args
     load = scene.load
     assert isinstance(load, Pulse)
     mechanics = mechanics_about_sliding(scene)
@@ -94,12 +90,12 @@ def _after_kick(args, numbers, adapted=lambda method: method):
     contact = jax.tree.map(lambda own, other: jnp.where(quiet, own, other), start.contact, contact)
     longest = longest_return(scene) * crossings
     kick, start = Kick(more, load.duration), Point(start.y, contact)
-    return to_crossing(adapted(how.method), mechanics, start, crossings, longest, numbers, kick)
+    return to_crossing(method, mechanics, start, crossings, longest, numbers, kick)
 
 
 def _derived_after_kick(args, numbers):
-    return _after_kick(args, numbers, for_derivatives)
+    return _after_kick(args, numbers, for_derivatives(EXACT_STEPPER))
 
 
-# Of (how, scene, start, crossings).
+# Of (scene, start, crossings).
 _motion_after_kick = KernelFunction(_after_kick, _derived_after_kick)

@@ -25,7 +25,6 @@ from ..model.scene import Scene
 from ..section.about_sliding import weights_of
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps
-from ..steppers.event_exact import EventExact
 from .response import MOST_CROSSINGS, Crossings, kicked, returned, started
 
 # The most trajectories of Newton's method, and the relative change of p at which it has converged.
@@ -128,14 +127,14 @@ def critical_kick(
     **Arguments:** `scene`, whose load is a `Pulse`; `bracket`, values of p on either side; `names` of the parameters;
     `saddle`, if it is known.
     """
-    stepper, weights = EventExact(), weights_of(scene.structure)
+    weights = weights_of(scene.structure)
     low, high = bracket
     # With all derivatives in each trajectory: one kernel for these, too, takes longer to build than they take.
     directions = directions_of(scene, ("p", *names))
     # From the side that slides: there only the saddle makes a motion with events repeat.
     p, best, crossings = low, np.inf, MOST_CROSSINGS
     for taken in range(1, MOST_TRAJECTORIES + 1):
-        path = kicked(scene.replace(p=p), stepper, directions, crossings)
+        path = kicked(scene.replace(p=p), directions, crossings)
         if saddle is None:
             saddle = saddle_passed(scene, path)
             if saddle is None:
@@ -151,7 +150,7 @@ def critical_kick(
         if not low - (high - low) <= p + step <= high + (high - low):
             return None
         if abs(step) <= EXACT * p or (best < 1e-11 * p and abs(step) >= 0.5 * best):
-            slopes = _derivatives(scene.replace(p=p), stepper, names, directions, saddle, path, near)
+            slopes = _derivatives(scene.replace(p=p), names, directions, saddle, path, near)
             return Critical(p, slopes, taken, saddle.closed)
         # The next trajectory stays near the saddle for longer, but not twice as long.
         crossings = min(2 * int(near.place[-1]) + 32, MOST_CROSSINGS)
@@ -161,7 +160,6 @@ def critical_kick(
 
 def _derivatives(
     scene: Scene,
-    stepper: EventExact,
     names: tuple[str, ...],
     directions: Scene,
     saddle: Saddle,
@@ -172,7 +170,7 @@ def _derivatives(
     with np.errstate(all="ignore"):
         error = near.distance / np.abs(near.slope)
     place = int(near.place[np.nanargmin(error)])
-    of_saddle = returned(scene, stepper, directions, saddle.closed.point, saddle.closed.crossings)
+    of_saddle = returned(scene, directions, saddle.closed.point, saddle.closed.crossings)
     moved = (weights * of_saddle.y_parameter[:, saddle.closed.crossings - 1]) @ saddle.left / (1 - saddle.multiplier)
     value = (weights * path.y_parameter[:, place]) @ saddle.left - moved
     return dict(zip(names, (-value[1:] / value[0]).tolist(), strict=True))
@@ -186,9 +184,9 @@ def manifold_normal(
 
     **Arguments:** `scene`; `y`, a deviation from the sliding equilibrium under the final load; `saddle`, if it is known.
     """
-    stepper, weights = EventExact(), weights_of(scene.structure)
+    weights = weights_of(scene.structure)
     start = ReturnMaps.of(scene).in_contact(np.zeros(1, int), np.asarray(y)[None]).point(0)
-    path = started(scene, stepper, start, np.eye(len(y)), MOST_CROSSINGS)
+    path = started(scene, start, np.eye(len(y)), MOST_CROSSINGS)
     saddle = saddle_passed(scene, path) if saddle is None else saddle
     if saddle is None:
         return None

@@ -28,9 +28,9 @@ from ..model.directions import directions_of
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding, slowest_period
-from ..section.crossings import MOST_SEGMENTS, ByMethod
+from ..section.crossings import MOST_SEGMENTS
 from ..steppers.core import Segment, follow
-from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.kernel_scope import has_kernel
 
 # The most events that are compared; and the longest time in which two motions separate, in slowest periods.
@@ -67,12 +67,12 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
     """
     # The most touches that are tried; and how far below one the next is sought, relative to p.
     most_touches, just_below = 8, 1e-11
-    stepper, (low, high) = EventExact(), bracket
+    low, high = bracket
     period = float(slowest_period(scene.structure))
     directions = directions_of(scene, ("p", *names))
 
     def events(p: float) -> _Events:
-        found, _ = _to_events((ByMethod(stepper), scene.replace(p=p)), by_kernel=has_kernel(scene, stepper))
+        found, _ = _to_events((scene.replace(p=p),), by_kernel=has_kernel(scene, EXACT_STEPPER))
         return found
 
     below, above, found = events(low), events(high), None
@@ -80,7 +80,7 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
         parting = _parting(below, above, TOGETHER * period)
         if parting is None:
             return found
-        touch = _Touch(scene, stepper, directions, names, period, (low, high), *parting)
+        touch = _Touch(scene, directions, names, period, (low, high), *parting)
         found = _touched(touch) or _touched_as_the_kick_ends(touch)
         if found is None:
             return None
@@ -94,7 +94,6 @@ class _Touch(NamedTuple):
     """What may just touch zero: a guard of the first event that only one of the kicks at the ends of a bracket leads to."""
 
     scene: Scene
-    stepper: EventExact
     directions: Scene  # by p, then by the parameters
     names: tuple[str, ...]  # of the parameters
     period: float  # the slowest, s
@@ -105,7 +104,7 @@ class _Touch(NamedTuple):
 
     def of(self, scene: Scene, time: float, with_time: Sequence[float] | None = None):
         """`_guard` of the scene at a time."""
-        return _guard(scene, self.stepper, self.directions, time, self.events, self.guard, with_time)
+        return _guard(scene, self.directions, time, self.events, self.guard, with_time)
 
     def is_near(self, p: float) -> bool:
         """Whether a kick is no further outside of the bracket than that is wide."""
@@ -189,7 +188,7 @@ def _start_of_kick(scene: Scene) -> tuple[Mechanics, Contact, Float[Array, ""], 
 
 def _find_events(args, _):
     """The events of the motion after the kick."""
-    how, scene = args
+    (scene,) = args
     mechanics, contact, more, y = _start_of_kick(scene)
 
     def stretch(carry, part):
@@ -208,7 +207,7 @@ def _find_events(args, _):
             )
 
         after = follow(
-            how.method,
+            EXACT_STEPPER,
             mechanics,
             contact,
             load,
@@ -235,7 +234,6 @@ _to_events = KernelFunction(_find_events)
 
 def _guard(
     scene: Scene,
-    stepper: EventExact,
     directions: Scene,
     time: float,
     events: int,
@@ -245,7 +243,7 @@ def _guard(
     """A guard at a time after `events` events, its time derivative, and its derivatives along directions of the parameters, in
     which the time changes by `with_time`.
     """
-    args = ByMethod(for_derivatives(stepper)), scene, np.asarray(time), np.int32(events), np.int32(guard)
+    args = scene, np.asarray(time), np.int32(events), np.int32(guard)
     count = len(jax.tree.leaves(directions)[0])
     moves = np.zeros(count) if with_time is None else np.asarray(with_time)
     # By time, then along the directions.
@@ -253,22 +251,22 @@ def _guard(
         lambda leaf: np.moveaxis(np.pad(leaf, [(1, 0)] + [(0, 0)] * (leaf.ndim - 1)), 0, -1), directions
     )
     still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), 1 + count)), args)
-    moving = still[0], along, np.append(1.0, moves), *still[3:]
-    by_kernel = has_kernel(scene, stepper)
+    moving = along, np.append(1.0, moves), *still[2:]
+    by_kernel = has_kernel(scene, EXACT_STEPPER)
     (value, _), (slopes, _) = _to_guard.derived(args, moving, by_kernel=by_kernel)
     return float(value), float(slopes[0]), slopes[1:]
 
 
 def _find_guard(args, _):
-    how, scene, time, events, guard = args
-    mechanics, contact, more, y = _start_of_kick(scene)
+    scene, time, events, guard = args
+    (mechanics, contact, more, y), stepper = _start_of_kick(scene), for_derivatives(EXACT_STEPPER)
     duration, happened = scene.load.duration, jnp.zeros((), jnp.int32)
 
     def stretch(carry, part):
         y, contact, happened = carry
         h, load = part
         after = follow(
-            how.method,
+            stepper,
             mechanics,
             contact,
             load,
@@ -281,7 +279,7 @@ def _find_guard(args, _):
             kind="lax",
         )
         # After the last event the motion goes on in this mode, regardless of its guards.
-        y = how.method.in_one_mode(mechanics, after.contact, after.y, after.left, load)
+        y = stepper.in_one_mode(mechanics, after.contact, after.y, after.left, load)
         return (y, after.contact, after.total), None
 
     in_kick, none = jnp.minimum(time, duration), jnp.zeros_like(more)

@@ -10,9 +10,9 @@ from ..contact import Contact
 from ..foundation.argument_forms import Form
 from ..kernels.kernel import kernel_of
 from ..model.scene import Scene
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EXACT_STEPPER
 from ..steppers.kernel_scope import goes_side_by_side, has_kernel
-from .crossings import Arrival, ByMethod, Point, motion_to_section
+from .crossings import Arrival, Point, motion_to_section
 
 # Rows of numbers for a kernel are put together for so many bytes at a time.
 AT_A_TIME = 2**26
@@ -29,7 +29,7 @@ class SectionKernels:
         of_contacts = np.zeros(np.shape(mechanics.belt_speed))
         start = Point(np.zeros(2 * len(mechanics.free_load)), Contact(of_contacts.astype(np.int32), of_contacts))
         last = np.int32(1), np.float64(np.inf), np.bool_(False)
-        self.form = Form.of((ByMethod(EventExact()), first, start, *last))[0].kept
+        self.form = Form.of((first, start, *last))[0].kept
         # The state comes after what is the group's; derivatives are by it.
         state = len(jax.tree.leaves(whose))
         self.wide = tuple(place == state for place in range(len(self.form.arrays)))
@@ -93,7 +93,7 @@ def section_kernels(
     """The kernels of groups of scenes like this one, for many trajectories if they go `side_by_side`; None where there are
     none.
     """
-    if not has_kernel(scene, EventExact(), called_by_xla=False):
+    if not has_kernel(scene, EXACT_STEPPER, called_by_xla=False):
         return None
     return SectionKernels((mechanics, longest_return), pool, side_by_side and goes_side_by_side(scene))
 

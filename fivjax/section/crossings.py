@@ -16,7 +16,7 @@ from ..foundation.carried import depending_on
 from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..steppers.core import left_after, next_part
-from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.event_exact import EXACT_STEPPER, EventExact, for_derivatives
 from .about_sliding import longest_return, mechanics_about_sliding
 from .peak_speed import higher_peak
 
@@ -29,12 +29,6 @@ class Point(eqx.Module):
 
     y: State
     contact: Contact
-
-
-class ByMethod(eqx.Module):
-    """How a motion is followed, fixed when it is traced."""
-
-    method: EventExact = eqx.field(static=True)
 
 
 class Crossing(NamedTuple):
@@ -150,17 +144,17 @@ def to_crossing(
     return Arrival(here(way), way.crossed, arrived, way.peak), rows
 
 
-def _to_section(args, numbers, adapted=lambda method: method):
-    how, whose, start, crossings, time, peaks = args
+def _to_section(args, numbers, method=EXACT_STEPPER):
+    whose, start, crossings, time, peaks = args
     mechanics, longest = (mechanics_about_sliding(whose), longest_return(whose)) if isinstance(whose, Scene) else whose
     longest = jnp.minimum(time, longest * crossings)
-    return to_crossing(adapted(how.method), mechanics, start, crossings, longest, numbers, peaks=peaks)
+    return to_crossing(method, mechanics, start, crossings, longest, numbers, peaks=peaks)
 
 
 def _derived_to_section(args, numbers):
-    return _to_section(args, numbers, for_derivatives)
+    return _to_section(args, numbers, for_derivatives(EXACT_STEPPER))
 
 
-# Of (how, scene, start, crossings, the longest time in s, whether the largest speed is asked for). In place of the scene there
+# Of (scene, start, crossings, the longest time in s, whether the largest speed is asked for). In place of the scene there
 # may be what the motion needs of it: (mechanics, longest return in s).
 motion_to_section = KernelFunction(_to_section, _derived_to_section)

@@ -23,7 +23,7 @@ from ..foundation.numpy_evaluation import by_numpy
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
-from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.section import FADED
 from .about_sliding import longest_return, mechanics_about_sliding, weights_of
 from .by_kernel import SectionKernels, section_kernels
@@ -357,8 +357,7 @@ def known_for_section(scene: Scene) -> tuple[Mechanics, Float[Array, ""]]:
 
 def _to_crossing(shared, row, rows: int, careful: bool = False, peaks: bool = False):
     (mechanics, longest), (y, status, direction, crossings) = shared, row
-    start, method = Point(y, Contact(status, direction)), EventExact()
-    method = for_derivatives(method) if careful else method
+    start, method = Point(y, Contact(status, direction)), for_derivatives(EXACT_STEPPER) if careful else EXACT_STEPPER
     numbers = crossings - jnp.arange(rows, dtype=y.dtype)[::-1]
     end, path = to_crossing(method, mechanics, start, crossings, longest * crossings, numbers, peaks=peaks)
     found = end.at.point

@@ -266,6 +266,10 @@ def for_derivatives(stepper: Stepper) -> Stepper:
     return cast(Stepper, short)
 
 
+# How motions are followed wherever no method is asked for.
+EXACT_STEPPER = EventExact()
+
+
 class _Restepped(AbstractLocalInterpolation):
     """States inside a step, by stepping again from its start: as exact as the step, through every event in it."""
 
