@@ -17,7 +17,7 @@ from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import mechanics_about_sliding
 from .multiple_shooting import AT_SECTION, Mode, PhaseImages, Phases, images_of_phases, inside, one_after_another
-from .pseudo_arclength import ComputedCycle, Curve, assembled
+from .pseudo_arclength import ComputedCycle, Curve, assembled, scaled
 
 NAMES = {
     (Status.SLIDE, 0): "grazing of N",
@@ -84,11 +84,11 @@ def guard_minima(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
             inner = guard[1:-1]
             for i in np.flatnonzero((inner <= guard[:-2]) & (inner <= guard[2:])) + 1:
                 bend = float(guard[i - 1] - 2 * guard[i] + guard[i + 1]) / step**2
-                slope = (guard[i + 1] - guard[i - 1]) / (2 * step)
-                shift = -slope / bend if bend > 0 else 0.0
-                value = guard[i] + 0.5 * slope * shift
                 if bend <= 0:
                     continue
+                slope = (guard[i + 1] - guard[i - 1]) / (2 * step)
+                shift = -slope / bend
+                value = guard[i] + 0.5 * slope * shift
                 found.append(GuardMinimum(k, own, float(i * step + shift), float(value / size), float(bend)))
     return sorted(found, key=lambda minimum: minimum.value)
 
@@ -180,12 +180,11 @@ def grazing_near(curve: Curve, guess: ComputedCycle, minimum: GuardMinimum) -> G
         residuals, rows = np.append(residuals, partial.guard[0]), rows * curve.scales
         row = row_of(curve, phases, minimum, partial)
         system = np.vstack([rows, row])
-        sizes = np.max(np.abs(system), axis=1)
-        sizes = np.where(sizes > 0, sizes, 1.0)
         if not (np.all(np.isfinite(system)) and np.all(np.isfinite(residuals))):
             return None
+        system, sizes = scaled(system)
         try:
-            step = -np.linalg.solve(system / sizes[:, None], residuals / sizes)
+            step = -np.linalg.solve(system, residuals / sizes)
         except np.linalg.LinAlgError:
             return None
         size = float(np.max(np.abs(step)))

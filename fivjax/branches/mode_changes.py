@@ -243,8 +243,7 @@ def _shorter(family: Family, valid: ComputedCycle, phase: int):
     change = change_between(modes, kept)
     if change is None:
         return None
-    guess = without(phases, change._replace(phase=phase), kept)
-    return None if guess is None else (guess, change)
+    return without(phases, change._replace(phase=phase), len(kept)), change
 
 
 def with_own_rebounds(

@@ -70,10 +70,8 @@ class Curve:
         family = self.family
         found = images(family.at(parameter), family.direction, phases)
         residuals, rows = assembled(found, phases)
-        rows = rows * self.scales
-        sizes = np.max(np.abs(rows), axis=1)
-        sizes = np.where(sizes > 0, sizes, 1.0)
-        return residuals / sizes, rows / sizes[:, None], found, phases, parameter
+        rows, sizes = scaled(rows * self.scales)
+        return residuals / sizes, rows, found, phases, parameter
 
     def corrected(
         self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None
@@ -180,6 +178,13 @@ def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
     if status == Status.DETACH:
         return 1 if was == Status.DETACH else 3
     return 0
+
+
+def scaled(rows: Float[np.ndarray, "k m"]) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, " k"]]:
+    """Rows of derivatives divided by their largest entries, and these; a row of zeros as it is."""
+    sizes = np.max(np.abs(rows), axis=1)
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    return rows / sizes[:, None], sizes
 
 
 def assembled(found: PhaseImages, phases: Phases) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from ..model.scene import Scene
 from .branch_points import BranchPoint
 from .grazing import images_up_to_minimum, row_of, up_to_minimum, without_minimum
 from .multiple_shooting import PhaseImages, images_along, one_after_another
-from .pseudo_arclength import Curve, Family, assembled, multipliers_of
+from .pseudo_arclength import Curve, Family, assembled, multipliers_of, scaled
 from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
 # Relative change of a parameter for differences of rates; and of multipliers, of cycles that Newton's method corrects only
@@ -68,20 +68,19 @@ def _derivative(family: Family, special: Special, row, name: str, direction: Sce
     _, own = assembled(cycle.images, cycle.phases)
     slope, own = rows[:, -1], own * curve.scales
     if special.turns:
-        left, _, _ = np.linalg.svd(own[:, :-1] / np.max(np.abs(own), axis=1, keepdims=True))
-        null = left[:, -1] / np.max(np.abs(own), axis=1)
+        each, sizes = scaled(own)
+        left, _, _ = np.linalg.svd(each[:, :-1])
+        null = left[:, -1] / sizes
         return float(-(null @ slope) / (null @ own[:, -1]) * curve.scales[-1])
     if special.multiplier is not None:
         return _of_multiplier(family, special, name, direction, own, slope)
     if row is None:
         return np.nan
-    system = np.vstack([own, row])
-    sizes = np.max(np.abs(system), axis=1)
-    scaled = system / sizes[:, None]
+    system, sizes = scaled(np.vstack([own, row]))
     # Where two special points coincide the equations do not tell them apart. Else this is some thousand.
-    if not np.linalg.cond(scaled) < 1e10:
+    if not np.linalg.cond(system) < 1e10:
         return np.nan
-    change = np.linalg.solve(scaled, -np.append(slope, last) / sizes)
+    change = np.linalg.solve(system, -np.append(slope, last) / sizes)
     return float(change[-1] * curve.scales[-1])
 
 
@@ -130,8 +129,8 @@ def _of_multiplier(
     value = float(np.asarray(family.at(cycle.parameter).parameters[name]))
     by = APART_ON_CURVE * (abs(value) if value else 1.0)
     tangent = curve.tangent(cycle, None)
-    sizes = np.max(np.abs(own), axis=1)
-    across = np.linalg.lstsq(own / sizes[:, None], -slope / sizes, rcond=None)[0]
+    each, sizes = scaled(own)
+    across = np.linalg.lstsq(each, -slope / sizes, rcond=None)[0]
 
     def size(along: float, other: float) -> float:
         moved = family._replace(scene=moved_along(family.scene, direction, other))

@@ -159,11 +159,9 @@ def change_between(longer: Sequence[Mode], shorter: Sequence[Mode]) -> Change | 
         if count - len(shorter) == 1:
             kept = longer[:i] + longer[i + 1 :]
             if same_modes(kept, shorter):
-                split = alike(longer[i], after) and longer[i].ending != after.ending
-                split = split or (alike(longer[i], after) and longer[i].lands)
-                if split:
-                    return Change(i, split, "impact", where(longer[i], longer[i].ending // 2))
-                return Change(i, split, *_inserted(longer[i], after))
+                if alike(longer[i], after) and (longer[i].ending != after.ending or longer[i].lands):
+                    return Change(i, True, "impact", where(longer[i], longer[i].ending // 2))
+                return Change(i, False, *_inserted(longer[i], after))
     return None
 
 
@@ -175,8 +173,10 @@ def _inserted(mode: Mode, after: Mode) -> tuple[str, str]:
     return words[Status(mode.status[contact])], where(mode, contact)
 
 
-def grazing_of(curve: Curve, guess: ComputedCycle, lowest: int = 4) -> Grazing | None:
+def grazing_of(curve: Curve, guess: ComputedCycle) -> Grazing | None:
     """The cycle near a guess on which a guard touches zero: the nearest one of those found."""
+    # The most minima of guards that are tried, the lowest.
+    lowest = 4
     for minimum in sorted(guard_minima(curve, guess), key=lambda minimum: abs(minimum.value))[:lowest]:
         found = grazing_near(curve, guess, minimum)
         if found is not None:
@@ -204,13 +204,11 @@ def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> st
     return f"{how}: {what.removesuffix(where(mode, grazing.minimum.guard // 2))}" if what else how
 
 
-def without(phases: Phases, change: Change, shorter: Sequence[Mode]) -> Phases | None:
-    """The phases without the vanishing one."""
+def without(phases: Phases, change: Change, count_left: int) -> Phases:
+    """The phases without the vanishing one, and where it takes another with it, without that: so many."""
     count, i = len(phases.modes), change.phase
     y, h = phases.y, phases.h
-    if len(shorter) == 1 and shorter[0].ending == AT_SECTION:
-        return None
-    if not change.merges or count - len(shorter) == 1:
+    if not change.merges or count - count_left == 1:
         keep = [j for j in range(count) if j != i]
         h = h.copy()
         if change.merges:

@@ -1,5 +1,7 @@
 """The result of a search: uncertainties, which parameters are identifiable, and whether the model fits."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,11 +58,8 @@ def concluded(search: FitSearch, identifiable_within: float) -> Calibration:
         correlation=correlation[:size, :size],
         singular_values=singular,
         offsets=tuple(offsets),
-        recordings=search.recordings,
-        t=tuple(np.asarray(m.t) for m in problem.misfits),
-        measured=tuple(np.asarray(m.means) for m in problem.misfits),
         fitted=tuple(models),
-        noise=tuple(_noise(m) for m in problem.misfits),
+        **_of_recordings(problem, search.recordings),
         left=left,
         evaluations=search.evaluations,
         outcome=outcome,
@@ -80,20 +79,22 @@ def not_tried(problem: Problem, recordings, outcome: FitOutcome) -> Calibration:
         correlation=np.eye(size),
         singular_values=np.zeros(problem.places[-1].stop),
         offsets=(None,) * len(means),
-        recordings=recordings,
-        t=tuple(np.asarray(m.t) for m in problem.misfits),
-        measured=tuple(means),
         fitted=tuple(np.full_like(part, np.nan) for part in means),
-        noise=tuple(_noise(m) for m in problem.misfits),
+        **_of_recordings(problem, recordings),
         left=ResidualTests(nan, False, False, nan, False),
         evaluations=0,
         outcome=outcome,
     )
 
 
-def _noise(mine) -> np.ndarray:
-    """The standard deviation of a block's mean, by channel."""
-    return np.median(np.asarray(mine.sigma), axis=0)
+def _of_recordings(problem: Problem, recordings) -> dict[str, Any]:
+    """What a result says of its recordings; the noise is the standard deviation of a block's mean, by channel."""
+    return {
+        "recordings": recordings,
+        "t": tuple(np.asarray(mine.t) for mine in problem.misfits),
+        "measured": tuple(np.asarray(mine.means) for mine in problem.misfits),
+        "noise": tuple(np.median(np.asarray(mine.sigma), axis=0) for mine in problem.misfits),
+    }
 
 
 def _stated(recordings) -> bool:

@@ -12,12 +12,8 @@ from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
 from .shooting import Cycle, first_tangential
 
-
-def is_closed(correction: float) -> bool:
-    """Whether a correction of this relative size is the last one needed."""
-    # A cycle is closed when its correction is this small, relative to its size: the next one would be rounding.
-    closed = 1e-7
-    return correction <= closed
+# A cycle is closed when its correction is this small, relative to its size: the next one would be rounding.
+CLOSED = 1e-7
 
 
 def predicted(tangential: int, moved: Float[Array, " j"], about) -> tuple[Cycle, ...]:

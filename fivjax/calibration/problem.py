@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
 from ..model.scene import Scene
-from .cycle_closing import corrected, is_closed, predicted
+from .cycle_closing import CLOSED, corrected, predicted
 from .cycle_misfit import CycleMisfit
 from .least_squares import Evaluated
 from .misfit import AbstractMisfit
@@ -112,10 +112,10 @@ class Problem(eqx.Module):
             found = _compared(self, point, begin, window, cycles)
             cycles, correction = found.about.cycles, float(found.correction)
             # A cycle that is not finite will not close any more.
-            if is_closed(correction) or not np.isfinite(correction):
+            if correction <= CLOSED or not np.isfinite(correction):
                 break
         residual, jacobian = np.asarray(found.residual), np.asarray(found.jacobian)
-        if not (is_closed(correction) and np.isfinite(residual).all() and np.isfinite(jacobian).all()):
+        if not (correction <= CLOSED and np.isfinite(residual).all() and np.isfinite(jacobian).all()):
             return Evaluated(np.full_like(residual, np.inf), np.zeros_like(jacobian), found.about)
         return Evaluated(residual, jacobian, found.about)
 

@@ -120,14 +120,10 @@ class Map:
         counts = {verdict: int((dataset["verdict"] == verdict).sum()) for verdict in fj.Verdict}
         for verdict, count in counts.items():
             if count:
-                print(f"  {number(count, 'trajectory', 'trajectories'):>20s}: {_in_words(verdict)}")
+                print(f"  {number(count, 'trajectory', 'trajectories'):>20s}: {verdict.words}")
         if not any(counts[verdict] for verdict in fj.Verdict if verdict >= fj.Verdict.UNDECIDED):
-            reasons = ", ".join(_in_words(verdict) for verdict, count in counts.items() if count)
+            reasons = ", ".join(verdict.words for verdict, count in counts.items() if count)
             raise Failure(f"No trajectory of the map could be followed: {dataset.attrs.get('failure', reasons)}.")
-
-
-def _in_words(verdict) -> str:
-    return verdict.name.lower().replace("_", " ")
 
 
 def _listed(paths: list[Path]) -> str:

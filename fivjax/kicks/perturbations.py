@@ -5,7 +5,8 @@ sliding (normal forces and slip speeds) linearly: the change at the time $t$ is 
 margin over $\sup_t |κ(t)|_*$, in the dual norm, ever ends sliding. The supremum is bounded between instants, too.
 """
 
-from typing import NamedTuple, Protocol
+import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -60,28 +61,6 @@ class StableSliding(NamedTuple):
     margins: list[Margin]  # of slip and of pressing, of each contact
 
 
-class Perturbation(Protocol):
-    """A kind of perturbation, with the functions that a search for the smallest one needs."""
-
-    sliding: StableSliding
-
-    def norm(self, u: Vectors) -> Float[np.ndarray, " k"]: ...
-
-    def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """The vector of norm one with the largest scalar product with a gradient."""
-        ...
-
-    def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
-        """Deviations from sliding at the end of the perturbation."""
-        ...
-
-    def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
-        """The gradient by u, from the gradient by the state."""
-        ...
-
-    def certificate(self) -> Certificate: ...
-
-
 def stable_sliding(scene: Scene) -> StableSliding:
     """Sliding in modal coordinates, without the leading axis of groups.
 
@@ -116,6 +95,9 @@ def _linear(scene: Scene) -> LinearSliding:
 class InitialStates:
     """Deviations from sliding of contacts that stay closed; the norm is the square root of their energy, in √J."""
 
+    # What it is called, and its largest norm.
+    over, most = "state", math.inf
+
     def __init__(self, scene: Scene):
         self.scene, self.sliding, self.places = scene, stable_sliding(scene), _free_states(scene)
         free = self.places[: len(self.places) // 2]
@@ -130,17 +112,24 @@ class InitialStates:
         return np.sqrt(np.einsum("ki,ij,kj->k", u, self.energy, u))
 
     def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """The vector of norm one with the largest scalar product with a gradient."""
         along = gradient @ self.root
         return self.root @ along / np.linalg.norm(along)
 
     def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
+        """Deviations from sliding at the end of the perturbation."""
         full = np.zeros((len(u), 2 * self.scene.structure.size))
         full[:, self.places] = u
         return full
 
     def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
+        """The gradient by u, from the gradient by the state."""
         del u
         return gradient[self.places]
+
+    def values(self, u: Float[np.ndarray, " m"]) -> Float[np.ndarray, " state"]:
+        """What a user is told of a perturbation: the state itself."""
+        return np.asarray(self.sliding.linear.equilibrium) + self.states(u[None])[0]
 
     def certificate(self) -> Certificate:
         modes = self.sliding.modes
@@ -161,6 +150,8 @@ class InitialStates:
 
 class Histories:
     """Factors on the load, minus one, in equal pieces of a time; the norm is the largest absolute value."""
+
+    over, most = "history", 1.0
 
     def __init__(self, scene: Scene, pieces: int, time: float):
         self.scene, self.pieces, self.time = scene, pieces, time
@@ -186,6 +177,10 @@ class Histories:
         args = *self.given, u
         _, (slopes, _) = _after_history.derived_by(args, u, np.eye(len(u)), by_kernel=self.by_kernel)
         return gradient @ slopes
+
+    def values(self, u: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """The factors themselves."""
+        return 1.0 + u
 
     def certificate(self) -> Certificate:
         rates = np.asarray(self.sliding.modes.eigenvalues)

@@ -28,8 +28,8 @@ from ..model.scene import Scene
 from ..section.about_sliding import weights_of
 from ..verdicts.sliding_proof import envelope_peak
 from .critical import critical_perturbation
-from .perturbations import stable_sliding
-from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, dataset_of, smallest_history, smallest_state
+from .perturbations import Histories, InitialStates, stable_sliding
+from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, dataset_of, smallest_of
 from .stable_manifold import Saddle, critical_kick, saddle_of
 
 if TYPE_CHECKING:
@@ -227,10 +227,10 @@ def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], piec
         what = "the duration alone" if allowed else "nothing"
         raise ValueError(f"Argument `bounds` must name {what} where {over!r} is free, but has {unknown[0]!r}.")
     if over == "state":
-        return smallest_state(scene)
+        return smallest_of(InitialStates(scene))
     time = bounds.get("duration", (0.0, float(scene.load.duration)))[1]
     arguments.real_number("bounds['duration'][1]", time, above=0)
-    return smallest_history(scene, pieces, float(time))
+    return smallest_of(Histories(scene, pieces, float(time)))
 
 
 def _descended(scene: Scene, p: float, duration: float, shortest: float, longest: float) -> tuple[float, float]:

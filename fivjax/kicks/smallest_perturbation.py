@@ -16,7 +16,7 @@ from ..io.datasets import labelled
 from ..maps.basin_map import verdicts_from
 from ..maps.crossing import FirstCrossing, first_crossings, with_ends
 from ..model.scene import Scene
-from .perturbations import Histories, InitialStates, Perturbation, Vectors
+from .perturbations import Histories, InitialStates, Vectors
 from .stable_manifold import Saddle, manifold_normal
 
 if TYPE_CHECKING:
@@ -132,31 +132,18 @@ class NoSquealingKick(ValueError):
         return f"{self.args[0]} Below {self.certified:.6g}, the certified bound, none does."
 
 
-def smallest_state(scene: Scene) -> SmallestPerturbation:
-    """The initial state of least energy, on the belt and sliding, that leads to a limit cycle."""
-    kind = InitialStates(scene)
-    return _smallest(scene, "state", kind, np.inf)
-
-
-def smallest_history(scene: Scene, pieces: int, time: float) -> SmallestPerturbation:
-    """The history of the load, in equal pieces of a time (s), with the least deviation from the final load that leads to a
-    limit cycle.
-    """
-    return _smallest(scene, "history", Histories(scene, pieces, time), 1.0)
-
-
 class _Rays:
     """The smallest sizes along rays of perturbations that squeal."""
 
-    def __init__(self, scene: Scene, kind: Perturbation):
-        self.scene, self.kind = scene, kind
+    def __init__(self, kind: InitialStates | Histories):
+        self.kind = kind
         self.rest = np.asarray(kind.sliding.linear.equilibrium)
         self.attractors: dict[bytes, Attractors] = {}
         self.trajectories = 0
 
     def verdicts(self, u: Vectors) -> np.ndarray:
         self.trajectories += len(u)
-        return verdicts_from(self.scene, self.kind.states(u) + self.rest, "states", self.attractors)
+        return verdicts_from(self.kind.scene, self.kind.states(u) + self.rest, "states", self.attractors)
 
     def first(self, shapes: Vectors, sizes: np.ndarray, width: float) -> FirstCrossing:
         """The first crossing along each ray among `sizes` (rays, sizes). The smallest of all, and each that may be smaller, is
@@ -180,17 +167,18 @@ class _Rays:
         return self.verdicts((shapes[:, None] * sizes[..., None]).reshape(-1, shapes.shape[1])).reshape(sizes.shape)
 
 
-def _smallest(scene: Scene, over: str, kind: Perturbation, most: float) -> SmallestPerturbation:
-    certificate, rays = kind.certificate(), _Rays(scene, kind)
+def smallest_of(kind: InitialStates | Histories) -> SmallestPerturbation:
+    """The perturbation of this kind with the least norm that leads to a limit cycle."""
+    certificate, rays = kind.certificate(), _Rays(kind)
     shapes = certificate.shapes
-    largest = min(FARTHEST * certificate.size, most)
+    largest = min(FARTHEST * certificate.size, kind.most)
     sizes = np.tile(np.linspace(0.99 * certificate.size, largest, SCANNED), (len(shapes), 1))
     found = rays.first(shapes, sizes, ROUGH)
     if not np.any(np.isfinite(found.low)):
         raise NoSquealingKick(
             f"None of the {len(shapes)} shapes that were tried leads to a limit cycle at up to "
             f"{largest / certificate.size:.3g} times the certified bound. Look with `fivjax.basins`"
-            f"{', or for other shapes with another number of `pieces` or longest duration' if over == 'history' else ''}.",
+            f"{', or for other shapes with another number of `pieces` or longest duration' if kind.over == 'history' else ''}.",
             certificate.size,
         )
     best = int(np.nanargmin(np.where(np.isfinite(found.low), found.high, np.nan)))
@@ -198,7 +186,7 @@ def _smallest(scene: Scene, over: str, kind: Perturbation, most: float) -> Small
     saddle: Saddle | None = None
     for _ in range(MOST_STEPS):
         u = low * shape
-        normal = manifold_normal(scene, kind.states(u[None])[0], saddle)
+        normal = manifold_normal(kind.scene, kind.states(u[None])[0], saddle)
         if normal is None:
             break
         gradient, saddle = kind.pulled_back(u, normal[0]), normal[1]
@@ -216,5 +204,5 @@ def _smallest(scene: Scene, over: str, kind: Perturbation, most: float) -> Small
     ends = rays.first(shape[None], np.array([[low, high]]), EXACT)
     if np.isfinite(ends.low[0]):
         low, high = float(ends.low[0]), float(ends.high[0])
-    values = rays.rest + kind.states(high * shape[None])[0] if over == "state" else 1.0 + high * shape
-    return SmallestPerturbation(over, high, certificate.size, low, high, values, rays.trajectories, scene)
+    values = kind.values(high * shape)
+    return SmallestPerturbation(kind.over, high, certificate.size, low, high, values, rays.trajectories, kind.scene)

@@ -9,7 +9,7 @@ import functools
 import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -21,33 +21,13 @@ from ..foundation.stopping import stop_requests, waited_for
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
+from .checkpoint import Checkpoint
 from .executors import Workers, hand_out
 from .groups import Limits, groups_of
 from .jobs import Done, Job, run_job
 from .plan import Grid, Indices, Plan, TrajectoryList, plan_of
-from .results import Verdicts, count_of, not_run
-
-
-class Keeper(Protocol):
-    """An object that keeps results on disk while a run goes on."""
-
-    found: dict[int, dict[bytes, Attractors]]  # attractors from earlier jobs, by the first trajectory of each job
-
-    def recall(self, places: Indices | None) -> Verdicts:
-        """The results of an earlier run of these trajectories (all, unless given), in their order."""
-        ...
-
-    def job_file(self, places: Indices) -> tuple[str, str]:
-        """The path and the key of the file in which the job with these trajectories keeps how far it has come."""
-        ...
-
-    def keep(self, places: Indices, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
-        """Keep the results of the job with these trajectories; of its attractors, those that are needed later."""
-        ...
-
-    def flush(self) -> None:
-        """Write results that are not written yet."""
-        ...
+from .results import Verdicts, not_run
+from .store import Store
 
 
 class RunOptions(NamedTuple):
@@ -58,7 +38,7 @@ class RunOptions(NamedTuple):
     progress: bool | None = None  # whether there is a bar; unless given, in terminals and notebooks
     executor: Workers | None = None  # runs the jobs; unless given, threads of this process do
     # Gets the results of each job, and has those of an earlier run. A job with any missing result is run as a whole.
-    keeper: Keeper | None = None
+    keeper: Checkpoint | Store | None = None
     # Whether what is known by an interrupt is of no use: what a search has not run would count as what it has not found.
     all_or_none: bool = False
 
@@ -112,8 +92,9 @@ def run_to_verdict(
 def interrupted(verdicts: Verdicts) -> Verdicts:
     """What is known by now of trajectories, after a warning that says of how many nothing is."""
     total, left = len(verdicts.verdict), int(verdicts.pending().sum())
+    of = f"{total:,} {'trajectory' if total == 1 else 'trajectories'}"
     warnings.warn(
-        f"Interrupted: of {count_of(total, 'trajectory')}, {left} without a verdict, labelled {Verdict.NOT_RUN.value}.",
+        f"Interrupted: of {of}, {left} without a verdict, labelled {Verdict.NOT_RUN.value}.",
         stacklevel=3,
     )
     return verdicts

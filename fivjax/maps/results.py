@@ -84,9 +84,3 @@ def record(
             values[index] = terms[name]
     # Last and at once, so that a trajectory with a verdict is complete even after an interrupt.
     verdicts.verdict[index] = verdict
-
-
-def count_of(count: int, noun: str) -> str:
-    """A number with its noun: "1 trajectory", "2 trajectories"."""
-    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
-    return f"{count:,} {noun if count == 1 else plural}"

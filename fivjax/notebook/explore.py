@@ -201,9 +201,8 @@ def _in_words(known: tuple[Verdict, float] | None) -> str:
     if known is None:
         return "<b>verdict …</b>"
     verdict, when = known
-    name = verdict.name.lower().replace("_", " ")
     proved = verdict >= 0 and np.isfinite(when)
-    return f"<b>verdict: {name}</b>{f', known after {when:.3g} s' if proved else ''}"
+    return f"<b>verdict: {verdict.words}</b>{f', known after {when:.3g} s' if proved else ''}"
 
 
 def _said(run: Trajectory) -> list[str]:

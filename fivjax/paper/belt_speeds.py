@@ -1,7 +1,6 @@
 """Section 4.3: the influence of the belt speed (Table 2, Figs. 15 to 18)."""
 
 import numpy as np
-import xarray as xr
 from matplotlib.figure import Figure
 
 import fivjax as fj
@@ -10,7 +9,7 @@ from . import pictures
 from . import scenes as paper
 from .findings import Made, given, number, statement
 from .kicks import critical
-from .measures import Window, peak, straightness, two_cycles
+from .measures import Window, cycles_within, peak, straightness, two_cycles
 from .runs import Runs, energy_of
 
 
@@ -50,10 +49,10 @@ def figure_15(runs: Runs) -> Made:
     stick, detach = runs.first(name, 0), runs.first(name, 2)
     between = (cycles["cycle_start"].values > stick) & (cycles["cycle_end"].values < detach)
     gain = cycles["energy_gain"].values
-    straight = straightness(run, cycles, (stick, detach))
+    straight = straightness(cycles, (stick, detach))
     window = two_cycles(cycles, stick + 0.6 * (detach - stick), 3)
     contact = cycles["contact_work"].values
-    shown = shown_cycles(cycles, window)
+    shown = cycles_within(cycles, window)
     size = fj.sliding_equilibrium(run.scene)[0] - cycles["turning_point"].values[between]
     findings = (
         given(
@@ -117,12 +116,6 @@ def figure_15(runs: Runs) -> Made:
     return Made(caption, _growth(runs, name, window, "contact_work"), runs.data(name), findings)
 
 
-def shown_cycles(cycles: xr.Dataset, window: Window) -> np.ndarray:
-    """Which cycles lie wholly in a window."""
-    inside = (cycles["cycle_start"].values >= window[0] - 1e-9) & (cycles["cycle_end"].values <= window[1] + 1e-9)
-    return np.flatnonzero(inside)
-
-
 def in_millijoules(energies: np.ndarray) -> str:
     """Energies in J as text in mJ."""
     return ", ".join(f"{1e3 * energy:+.2f}" for energy in energies) + " mJ"
@@ -149,7 +142,7 @@ def figure_16(runs: Runs) -> Made:
     window = two_cycles(cycles, last - 0.4, 3)
     # From this time on every cycle that sticks loses energy.
     since = float(cycles["cycle_end"].values[sticks & (gain >= 0)].max(initial=0.0))
-    shown = shown_cycles(cycles, window)
+    shown = cycles_within(cycles, window)
     findings = (
         statement(
             "Section 4.3",

@@ -7,7 +7,7 @@ import fivjax as fj
 
 from . import pictures
 from .findings import Made, statement
-from .measures import Window, growth_rate, two_cycles
+from .measures import Window, cycles_within, growth_rate, two_cycles
 from .runs import Runs, energy_of
 
 
@@ -75,9 +75,7 @@ def figure_13(runs: Runs) -> Made:
     inside = (run.t >= window[0]) & (run.t <= window[1])
     detached = inside & (np.asarray(run.status) == 2)
     back = np.mean(np.asarray(run.velocity)[detached, 0] < 0)
-    work = cycles["contact_work"].values[
-        (cycles["cycle_start"] >= window[0] - 1e-9) & (cycles["cycle_end"] <= window[1] + 1e-9)
-    ]
+    work = cycles["contact_work"].values[cycles_within(cycles, window)]
     findings = (
         statement(
             "Fig. 13",

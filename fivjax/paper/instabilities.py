@@ -174,7 +174,7 @@ def figure_6(runs: Runs) -> Made:
     peaks = [peak(runs(name), 4.0) for name in shown.values()]
     early = (0.15, 0.9 * stick)
     shift = spectra.phase_shift(run, early, frequency(cycles, early), 1)
-    straight = straightness(run, cycles, (stick, detach))
+    straight = straightness(cycles, (stick, detach))
     findings = (
         statement(
             "Section 3.3",

@@ -57,7 +57,6 @@ def figure_9(runs: Runs) -> Made:
         "Fig. 9. Tangential acceleration after kicks of p = 1.2 and p = 1.19, μ = 0.227, 3 m/s; time from the kick."
     )
     picture = pictures.overlaid({"p = 1.2": over, "p = 1.19": under})
-    assert picture is not None
     return Made(caption, picture, runs.data("p = 1.2", "p = 1.19", cycles=False), findings)
 
 

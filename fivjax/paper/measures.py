@@ -8,16 +8,23 @@ import fivjax as fj
 Window = tuple[float, float]
 
 
+def cycles_within(cycles: xr.Dataset, window: Window) -> np.ndarray:
+    """Which cycles lie wholly in a window, to rounding."""
+    rounding = 1e-9
+    starts, ends = cycles["cycle_start"].values, cycles["cycle_end"].values
+    return np.flatnonzero((starts >= window[0] - rounding) & (ends <= window[1] + rounding))
+
+
 def frequency(cycles: xr.Dataset, window: Window) -> float:
     """Cycles per second in a window, from their own starts and ends."""
-    inside = (cycles["cycle_start"] >= window[0]) & (cycles["cycle_end"] <= window[1])
+    inside = cycles_within(cycles, window)
     start, end = cycles["cycle_start"].values[inside], cycles["cycle_end"].values[inside]
     return len(start) / float(end[-1] - start[0])
 
 
 def growth_rate(run: fj.Trajectory, cycles: xr.Dataset, window: Window) -> float:
     """Rate at which turning points move away from equilibrium in a window, in 1/s (a fitted exponential)."""
-    inside = (cycles["cycle_start"] >= window[0]) & (cycles["cycle_end"] <= window[1])
+    inside = cycles_within(cycles, window)
     rest = fj.sliding_equilibrium(run.scene)[run.scene.structure.tangential]
     amplitude = rest - cycles["turning_point"].values[inside]
     return float(np.polyfit(cycles["cycle_start"].values[inside], np.log(amplitude), 1)[0])
@@ -30,9 +37,9 @@ def growing_mode(scene: fj.Scene) -> tuple[float, float]:
     return float(values[k].imag / (2 * np.pi)), float(np.degrees(np.angle(vectors[0, k] / vectors[1, k])))
 
 
-def straightness(run: fj.Trajectory, cycles: xr.Dataset, window: Window) -> float:
+def straightness(cycles: xr.Dataset, window: Window) -> float:
     """R² of a straight line through the amplitudes of the cycles in a window."""
-    inside = (cycles["cycle_start"] >= window[0]) & (cycles["cycle_end"] <= window[1])
+    inside = cycles_within(cycles, window)
     t = cycles["cycle_start"].values[inside]
     amplitude = -cycles["turning_point"].values[inside]
     off = amplitude - np.polyval(np.polyfit(t, amplitude, 1), t)

@@ -23,9 +23,9 @@ Window = tuple[float, float]
 DEPTH = 40.0
 
 
-def friction_laws(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
+def friction_laws(dataset: xr.Dataset) -> Figure:
     """Friction coefficient over slip speed, one line for each `law` (Fig. 2)."""
-    figure = _new_figure(figure, 5.6, 3.8)
+    figure = _new_figure(5.6, 3.8)
     axes = figure.add_subplot()
     styles = [(VERMILION, "-"), (BLUE, "--"), (BLACK, "-.")]
     for law, (colour, line) in zip(dataset["law"].values, styles, strict=False):
@@ -36,12 +36,12 @@ def friction_laws(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figur
     return figure
 
 
-def onset(run: fj.Trajectory, spectrum: xr.Dataset, window: Window, *, figure: Figure | None = None) -> Figure:
+def onset(run: fj.Trajectory, spectrum: xr.Dataset, window: Window) -> Figure:
     """Accelerations along the belt and across it, a window of them, and the spectrogram (Figs. 4 and 5).
 
     `spectrum` is from `spectra.spectrogram`; across the belt is the paper's y1, coordinate 1.
     """
-    figure = _new_figure(figure, 8.4, 6.0)
+    figure = _new_figure(8.4, 6.0)
     panels = figure.subplot_mosaic("aa;bc")
     accelerations(panels["a"], run, (float(run.t[0]), float(run.t[-1])))
     panels["a"].axvspan(*window, color="0.8", zorder=0)
@@ -58,15 +58,15 @@ def onset(run: fj.Trajectory, spectrum: xr.Dataset, window: Window, *, figure: F
 
 
 def coexistence(
-    runs: Mapping[str, fj.Trajectory], zoomed: fj.Trajectory, zoom: Window, marks: Mapping[str, Window], *, figure=None
+    runs: Mapping[str, fj.Trajectory], zoomed: fj.Trajectory, zoom: Window, marks: Mapping[str, Window]
 ) -> Figure:
     """Tangential accelerations of several runs; below, a window of one of them with its normal acceleration (Fig. 6).
 
     `marks` are windows to point at by name, those of Fig. 7.
     """
-    figure = _new_figure(figure, 8.4, 6.4)
+    figure = _new_figure(8.4, 6.4)
     panels = figure.subplot_mosaic("a;b", height_ratios=(3, 2))
-    overlaid(runs, axes=panels["a"])
+    _overlay(panels["a"], runs)
     for name, (start, end) in marks.items():
         panels["a"].axvline(0.5 * (start + end), color=BLACK, lw=0.8, ls=":")
         panels["a"].annotate(
@@ -80,20 +80,21 @@ def coexistence(
     return lettered(figure, list(panels.values()))
 
 
-def overlaid(
-    runs: Mapping[str, fj.Trajectory], *, axes: Axes | None = None, figure: Figure | None = None
-) -> Figure | None:
-    """The tangential accelerations of several runs on one pair of axes, in the order given (Figs. 6(a) and 9)."""
-    if axes is None:
-        figure = _new_figure(figure, 8.4, 3.8)
-        axes = figure.add_subplot()
+def overlaid(runs: Mapping[str, fj.Trajectory]) -> Figure:
+    """The tangential accelerations of several runs (Fig. 9)."""
+    figure = _new_figure(8.4, 3.8)
+    _overlay(figure.add_subplot(), runs)
+    return figure
+
+
+def _overlay(axes: Axes, runs: Mapping[str, fj.Trajectory]) -> None:
+    """The tangential accelerations of several runs on one pair of axes, in the order given."""
     # Of different lightness, so that they can be distinguished in grey.
     shades = [(BLUE, ORANGE), (ORANGE, GREEN, BLACK)][len(runs) > 2]
     for (name, run), colour in zip(runs.items(), shades, strict=False):
         axes.plot(run.t, run.acceleration[:, run.scene.structure.tangential], color=colour, lw=0.5, label=name)
     axes.set(xlabel="time (s)", ylabel="tangential\nacceleration (m/s²)", xlim=(0, max(r.t[-1] for r in runs.values())))
     _thick(_legend_above(axes, columns=len(runs)))
-    return figure
 
 
 def accelerations(axes: Axes, run: fj.Trajectory, window: Window) -> None:
@@ -113,9 +114,9 @@ def accelerations(axes: Axes, run: fj.Trajectory, window: Window) -> None:
     axes.set(xlabel="time (s)", ylabel="acceleration (m/s²)", xlim=window)
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, figure: Figure | None = None) -> Figure:
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Figure:
     """A table of text (Tables 1 and 2)."""
-    figure = _new_figure(figure, 1.8 * len(columns), 0.5 + 0.32 * (len(rows) + 1))
+    figure = _new_figure(1.8 * len(columns), 0.5 + 0.32 * (len(rows) + 1))
     axes = figure.add_subplot()
     axes.set_axis_off()
     drawn = axes.table(
@@ -148,9 +149,9 @@ def lettered(figure: Figure, panels: Sequence[Axes] | None = None, names: Sequen
     return figure
 
 
-def _new_figure(figure: Figure | None, width: float, height: float) -> Figure:
-    """The figure to draw into: the one given, or a new one of this size in inches."""
-    return Figure(figsize=(width, height), layout="constrained") if figure is None else figure
+def _new_figure(width: float, height: float) -> Figure:
+    """A figure of this size in inches."""
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def _legend_above(axes: Axes, columns: int = 3) -> Legend:

@@ -6,14 +6,11 @@ import xarray as xr
 import fivjax as fj
 
 
-def spectrogram(
-    run: fj.Trajectory, quantity: str = "acceleration", coordinate: int | None = None, *, window: float = 0.2
-) -> xr.Dataset:
-    """The spectrum of one coordinate over time, as in Figs. 4(c) and 5(c).
+def spectrogram(run: fj.Trajectory, *, window: float = 0.2) -> xr.Dataset:
+    """The spectrum of the tangential acceleration over time, as in Figs. 4(c) and 5(c).
 
-    **Arguments:** `run`, with evenly spaced rows; `quantity`, "displacement", "velocity" or "acceleration"; `coordinate`, the
-    tangential one unless given; `window`, the length in s of the Hann windows, which overlap by nine tenths; its inverse is the
-    frequency resolution.
+    **Arguments:** `run`, with evenly spaced rows; `window`, the length in s of the Hann windows, which overlap by nine tenths;
+    its inverse is the frequency resolution.
 
     **Returns:** a dataset over `frequency` (Hz) and `t` (the middle of each window, s) with `level`, the power relative to the
     strongest of all, in dB.
@@ -30,8 +27,7 @@ def spectrogram(
     # Imported here, because it takes half a second.
     from scipy.signal import spectrogram as short_time_spectrum
 
-    coordinate = run.scene.structure.tangential if coordinate is None else coordinate
-    signal = np.asarray(getattr(run, quantity))[:, coordinate]
+    signal = np.asarray(run.acceleration)[:, run.scene.structure.tangential]
     frequency, t, power = short_time_spectrum(
         signal, rate, window="hann", nperseg=samples, noverlap=round(0.9 * samples), detrend="constant"
     )
@@ -39,7 +35,7 @@ def spectrogram(
     # The floor is far below the range that is drawn, and keeps levels finite.
     level = 10 * np.log10(np.maximum(power / (strongest if strongest > 0 else 1.0), 1e-20))
     return xr.Dataset(
-        {"level": (("frequency", "t"), level, {"long_name": f"power of {quantity}", "units": "dB"})},
+        {"level": (("frequency", "t"), level, {"long_name": "power of acceleration", "units": "dB"})},
         {
             "frequency": ("frequency", frequency, {"long_name": "frequency", "units": "Hz"}),
             "t": ("t", float(run.t[0]) + t, {"long_name": "time", "units": "s"}),

@@ -26,6 +26,11 @@ class Verdict(enum.IntEnum):
     STEP_FAILURE = Ending.STEP_FAILURE
     WORKER_LOST = -9
 
+    @property
+    def words(self) -> str:
+        """The name as a sentence has it: "limit cycle"."""
+        return self.name.lower().replace("_", " ")
+
 
 MEANING = {
     Verdict.SLIDING: "returns to steady sliding: a bound shows that no contact event can happen again",

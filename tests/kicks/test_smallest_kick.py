@@ -129,14 +129,14 @@ def test_the_smallest_state_is_given_in_the_structure_s_own_coordinates(monkeypa
     turned = in_general_coordinates(SCENE.structure)
     inside = []
 
-    def found(scene):
-        n = scene.structure.size
+    def found(kind):
+        scene, n = kind.scene, kind.scene.structure.size
         q, v = np.asarray(fj.sliding_equilibrium(scene)), np.zeros(n)
         v[0] = 0.1
         inside.append(scene)
         return smallest_perturbation.SmallestPerturbation("state", 1.0, 0.5, 1.0, 1.0, np.concatenate([q, v]), 0)
 
-    monkeypatch.setattr("fivjax.kicks.smallest.smallest_state", found)
+    monkeypatch.setattr("fivjax.kicks.smallest.smallest_of", found)
     scene = fj.Scene(turned, SCENE.friction, SCENE.belt_speed, SCENE.load)
     smallest = fj.smallest_kick(scene, over="state")
     y = smallest.values
