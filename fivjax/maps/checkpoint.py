@@ -1,9 +1,10 @@
 """The finished jobs of a long run, kept in one file while the run goes on.
 
-A checkpoint is a file with one value per trajectory of each result, and a description of the run it belongs to. It is always
-written as a whole under another name and then renamed, so at any instant, even after a power failure, the file is some earlier
-state of the run. It contains a job as a whole or not at all, so a resumed run gives, bit for bit, the results of one that was
-not interrupted. Jobs that are under way are kept beside it, in a folder that exists only while there are any (`job_files`).
+A checkpoint is a file with the results of finished jobs, the indices of their trajectories, and a description of the run. It is
+always written as a whole under another name and then renamed, so at any instant, even after a power failure, the file is some
+earlier state of the run. It contains a job as a whole or not at all, so a resumed run gives, bit for bit, the results of one that
+was not interrupted. Jobs that are under way are kept beside it (`job_files`), in a folder that exists only while there are any, or
+while a process writes the checkpoint: a lock in it keeps others out.
 """
 
 import contextlib
@@ -36,7 +37,7 @@ KEEP_EVERY, SHARE_OF_TIME = 2.0, 20.0
 # The name of the trajectories' indices.
 PLACE = "place"
 # The last bytes of the file, after the length of the list.
-MARK, LENGTH = b"fivjax.2", 8
+MARK, LENGTH = b"fivjax.3", 8
 # The number of values that share a checksum.
 BLOCK = 1024
 
@@ -54,22 +55,21 @@ class Contents(NamedTuple):
 class Checkpoint:
     """The file of a run: reads the results of an earlier run, and writes new ones.
 
-    `run` describes the run of `total` trajectories in plain Python values (that `json` can hold). Without a total the file has
-    the results of those alone that were run, and their indices.
+    `run` describes the run of `total` trajectories in plain Python values (that `json` can hold).
 
     **Raises:** as `read_checkpoint`.
     """
 
-    def __init__(self, path: str | Path, run: dict, total: int | None, energy: bool):
-        self.path, self.run = Path(path), run
-        self.verdicts, self.found = not_run(total or 0, energy), {}
-        # The indices of the results, in rising order, unless there is one for each trajectory; and those of jobs since then.
-        self._places, self._more = np.zeros(0, np.int64) if total is None else None, []
+    def __init__(self, path: str | Path, run: dict, total: int, energy: bool):
+        self.path, self.run, self.total, self.energy = Path(path), run, total, energy
+        self.verdicts, self.found = not_run(0, energy), {}
+        # The indices of the results, in rising order; and those of jobs since then, with theirs.
+        self._places, self._more = np.zeros(0, np.int64), []
         self._new, self._done, self._took = False, [], 0.0
         check_writable(path)
         self._lock = self._locked()
         try:
-            self._read(energy)
+            self._read()
         except BaseException:
             self._release()
             raise
@@ -82,17 +82,15 @@ class Checkpoint:
             return RunLock(self._jobs, f"Checkpoint `{self.path}`")
         return None
 
-    def _read(self, energy: bool) -> None:
-        run = self.run
-        kept = read_checkpoint(self.path, run)
+    def _read(self) -> None:
+        kept = read_checkpoint(self.path, self.run)
         if kept is None:
             # Interrupted before its first job was done: nothing else is left of a run.
             for theirs in runs_of(self._jobs):
-                refuse_other_run(f"What is kept in `{self._jobs}`", theirs, run)
+                refuse_other_run(f"What is kept in `{self._jobs}`", theirs, self.run)
         else:
-            if self._places is not None:
-                self._places = kept.results[PLACE]
-                self.verdicts = not_run(len(self._places), energy)
+            self._places = kept.results[PLACE]
+            self.verdicts = not_run(len(self._places), self.energy)
             for name, values in by_name(self.verdicts).items():
                 values[:] = kept.results[name]
             self._new = self._leave_out_damage(kept)
@@ -103,25 +101,22 @@ class Checkpoint:
         for name, parts in kept.damaged.items():
             for part in parts:
                 warnings.warn(
-                    f"Checkpoint `{self.path}` is damaged: the `{name}` of trajectories {part.start} to {part.stop - 1} is not "
-                    f"what was written. These trajectories are computed anew.",
+                    f"Checkpoint `{self.path}` is damaged: the `{name}` in its rows {part.start} to {part.stop - 1} is not "
+                    f"what was written. Their trajectories are computed anew.",
                     stacklevel=6,
                 )
                 self.verdicts.verdict[part] = Verdict.NOT_RUN
-        if self._places is not None:
-            whole = ~self.verdicts.pending()
-            self._places, self.verdicts = self._places[whole], jax.tree.map(lambda part: part[whole], self.verdicts)
+        whole = ~self.verdicts.pending()
+        self._places, self.verdicts = self._places[whole], jax.tree.map(lambda part: part[whole], self.verdicts)
         if kept.elsewhere:
             warnings.warn(f"Checkpoint `{self.path}` is damaged beside its results; it is written anew.", stacklevel=6)
         return bool(kept.damaged) or kept.elsewhere
 
     def recall(self, places: Indices | None) -> Verdicts:
         """The results kept of these trajectories (all, unless given)."""
-        if self._places is None or places is None:
-            chosen = slice(None) if places is None else places
-            return jax.tree.map(lambda leaf: leaf[chosen].copy(), self.verdicts)
         self._merge()
-        found = not_run(len(places), bool(self.verdicts.energy))
+        places = np.arange(self.total) if places is None else places
+        found = not_run(len(places), self.energy)
         known = np.isin(places, self._places)
         rows = np.searchsorted(self._places, places[known])
         for whole, kept in zip(jax.tree.leaves(found), jax.tree.leaves(self.verdicts), strict=True):
@@ -130,7 +125,7 @@ class Checkpoint:
 
     def _merge(self) -> None:
         """Put the results of the latest jobs among the others. A job that was run again has the same ones."""
-        if self._places is None or not self._more:
+        if not self._more:
             return
         places, verdicts = zip(*self._more, strict=True)
         self._places, first = np.unique(np.concatenate([self._places, *places]), return_index=True)
@@ -145,11 +140,7 @@ class Checkpoint:
         """Keep the results of a job; they are written if it is time."""
         if found is not None:
             self.found[int(places[0])] = found
-        if self._places is None:
-            for whole, own in zip(jax.tree.leaves(self.verdicts), jax.tree.leaves(verdicts), strict=True):
-                whole[places] = own
-        else:
-            self._more.append((places, verdicts))
+        self._more.append((places, verdicts))
         self._new = True
         self._done.append(places)
         if time.monotonic() - self._written >= max(KEEP_EVERY, SHARE_OF_TIME * self._took):
@@ -157,7 +148,7 @@ class Checkpoint:
 
     def close(self) -> None:
         """Release the lock, and remove the folder of jobs under way if there are none."""
-        if self._places is None and not self.verdicts.pending().any():
+        if len(self._places) == self.total and not self._more:
             shutil.rmtree(self._jobs, ignore_errors=True)
         self._release()
 
@@ -174,8 +165,7 @@ class Checkpoint:
         begun = time.monotonic()
         self._merge()
         found = {place: attractors_to_bytes(part) for place, part in self.found.items()}
-        results = by_name(self.verdicts) | ({} if self._places is None else {PLACE: self._places})
-        if write_checkpoint(self.path, self.run, results, found):
+        if write_checkpoint(self.path, self.run, by_name(self.verdicts) | {PLACE: self._places}, found):
             self._new = False
             for places in self._done:
                 Path(self.job_file(places)[0]).unlink(missing_ok=True)

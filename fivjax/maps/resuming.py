@@ -58,7 +58,7 @@ def keeper_at(
         "axes": {name: values.tolist() for name, values in grid.axes.items()},
     }
     if not is_store(path):
-        return Checkpoint(path, run, None if sparse else grid.total, energy)
+        return Checkpoint(path, run, grid.total, energy)
     if sparse:
         raise ValueError(
             f"Argument `resume` must be a file for a sparse map, but is the folder `{path}`: give another name."

@@ -81,7 +81,7 @@ def test_a_damaged_part_of_a_checkpoint_is_named_and_alone_is_computed_anew(pape
     first.close()
     at = path.read_bytes().find(np.arange(BLOCK, BLOCK + 4.0).tobytes())
     flipped(path, 8 * at)
-    with pytest.warns(UserWarning, match=rf"`amplitude` of trajectories {BLOCK} to {2 * BLOCK - 1} is not what was"):
+    with pytest.warns(UserWarning, match=rf"`amplitude` in its rows {BLOCK} to {2 * BLOCK - 1} is not what was"):
         again = Checkpoint(path, run, 3 * BLOCK, energy=False)
     assert np.flatnonzero(again.recall(None).pending()).tolist() == list(range(BLOCK, 2 * BLOCK))
     again.close()

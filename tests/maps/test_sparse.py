@@ -227,10 +227,10 @@ def test_damaged_results_of_a_sparse_map_count_as_not_run(tmp_path):
     verdicts = not_run(len(places), energy=False)
     for values in by_name(verdicts).values():
         values[:] = rng.integers(0, 2, len(places))
-    kept = Checkpoint(path, {"of": 1}, None, False)
+    kept = Checkpoint(path, {"of": 1}, 10**10, False)
 
     def recalled(path):
-        with contextlib.closing(Checkpoint(path, {"of": 1}, None, False)) as again:
+        with contextlib.closing(Checkpoint(path, {"of": 1}, 10**10, False)) as again:
             return again.recall(places)
 
     for part in np.array_split(rng.permutation(len(places)), 3):
@@ -250,7 +250,7 @@ def test_damaged_results_of_a_sparse_map_count_as_not_run(tmp_path):
         data[data.index(values) + 8 * 3000] ^= 1
         damaged = tmp_path / "damaged.part"
         damaged.write_bytes(bytes(data))
-        with pytest.warns(UserWarning, match="is damaged: the `(place|amplitude)` of trajectories 2048 to 3071"):
+        with pytest.warns(UserWarning, match="is damaged: the `(place|amplitude)` in its rows 2048 to 3071"):
             found = recalled(damaged)
         lost = np.flatnonzero(found.pending())
         assert lost.tolist() == list(range(2048, 3072))
