@@ -2,9 +2,9 @@
 
 A checkpoint is a file with the results of finished jobs, the indices of their trajectories, and a description of the run. It is
 always written as a whole under another name and then renamed, so at any instant, even after a power failure, the file is some
-earlier state of the run. It contains a job as a whole or not at all, so a resumed run gives, bit for bit, the results of one that
-was not interrupted. Jobs that are under way are kept beside it (`job_files`), in a folder that exists only while there are any, or
-while a process writes the checkpoint: a lock in it keeps others out.
+earlier state of the run. It contains a job as a whole or not at all, so a resumed run gives, bit for bit, the results of one
+that was not interrupted. Jobs that are under way are kept beside it (`job_files`), in a folder that exists only while there are
+any, or while a process writes the checkpoint: a lock in it keeps others out.
 """
 
 import contextlib

@@ -8,9 +8,9 @@ import pytest
 import fivjax as fj
 from fivjax.foundation import progress
 from fivjax.kicks import narrowing
-from fivjax.maps import bistability, jobs
+from fivjax.maps import bistability, engine, jobs
 from fivjax.maps.crossing import first_crossings
-from fivjax.maps.results import count_of, not_run
+from fivjax.maps.results import not_run
 
 KICKS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
 
@@ -113,8 +113,10 @@ def test_a_map_that_fails_as_a_whole_says_why(paper_scene, monkeypatch):
     assert "failure" not in fj.bistability_map(paper_scene, p=KICKS).attrs
 
 
-def test_numbers_go_with_their_nouns():
-    assert count_of(1, "trajectory") == "1 trajectory" and count_of(4096, "trajectory") == "4,096 trajectories"
+@pytest.mark.parametrize(("count", "said"), [(1, "1 trajectory"), (4096, "4,096 trajectories")])
+def test_numbers_go_with_their_nouns(count, said):
+    with pytest.warns(UserWarning, match=f"of {said}, {count} without a verdict"):
+        engine.interrupted(not_run(count, energy=False))
 
 
 def test_the_bar_says_that_it_compiles_before_anything_moves(paper_scene, monkeypatch):
