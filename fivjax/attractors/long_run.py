@@ -41,33 +41,36 @@ class Fates(NamedTuple):
     time: Float[np.ndarray, " m"]  # s
     changes: Int[np.ndarray, " m"]
 
+    def put(self, rows: Int[np.ndarray, " r"], found: "Fates") -> None:
+        """Write what becomes of the motions of these rows, from where they were known to be."""
+        self.chaotic[rows], self.without_events[rows] = found.chaotic, found.without_events
+        self.attractor.update((int(rows[row]), one) for row, one in found.attractor.items())
+        self.at.put(rows, found.at)
+        self.time[rows] += found.time
+        self.changes[rows] += found.changes
+
 
 def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) -> Fates:
     """What becomes of these motions; their loads are final. The catalogue gets the attractors that are found."""
     maps, group = catalogue.maps, motions.group
     at, _, changes, time, *_ = maps.returns(*motions, 1)
-    attractor: dict[int, CapturingSet] = {}
-    chaotic, without_events = np.zeros((2, len(group)), bool)
+    found = Fates(np.zeros(len(group), bool), {}, np.zeros(len(group), bool), at, time, changes)
     left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
     # A few of each group first: mostly the others are by now where these come to.
     for rows in (far_apart(maps.weights * at.y, group, left), np.arange(len(group))):
         rows = rows[left[rows]]
         left[rows] = False
         captured = catalogue.captures(Motions(group, at).rows(rows), np.ones(len(rows), bool))
-        attractor |= {int(rows[row]): one for row, one in captured.items()}
+        found.attractor.update((int(rows[row]), one) for row, one in captured.items())
         rows = np.delete(rows, list(captured))
         if len(rows):
-            found = _slow_fates(catalogue, Motions(group, at).rows(rows), onward[rows], slides)
-            chaotic[rows], without_events[rows] = found.chaotic, found.without_events
-            at.put(rows, found.at)
-            time[rows] += found.time
-            changes[rows] += found.changes
-            attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
+            slow = _slow_fates(catalogue, Motions(group, at).rows(rows), onward[rows], slides)
+            found.put(rows, slow)
             # Where none of these comes to anything, neither do others that go on.
-            ended = found.chaotic | found.without_events
-            ended[list(found.attractor)] = True
+            ended = slow.chaotic | slow.without_events
+            ended[list(slow.attractor)] = True
             onward &= np.isin(group, group[rows[ended]])
-    return Fates(chaotic, attractor, without_events, at, time, changes)
+    return found
 
 
 class _Underway(NamedTuple):
@@ -91,18 +94,14 @@ def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     count = len(motions.group)
     attractor: dict[int, CapturingSet] = {}
     run = _Underway(motions, np.zeros(count), np.zeros(count, int))
-    chaotic, without_events = np.zeros((2, count), bool)
-    if slides is not None:
-        without_events = _slide_on(catalogue, run, attractor, slides)
+    without_events = np.zeros(count, bool) if slides is None else _slide_on(catalogue, run, attractor, slides)
+    found = Fates(np.zeros(count, bool), attractor, without_events, run.motions.at, run.time, run.changes)
     left = ~without_events
     left[list(attractor)] = False
     rows = np.flatnonzero(left)
     if len(rows):
-        found = _long_fates(catalogue, run.motions.rows(rows), onward[rows], slides)
-        chaotic[rows], without_events[rows] = found.chaotic, found.without_events
-        run.move(rows, found.at, found.time, found.changes)
-        attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
-    return Fates(chaotic, attractor, without_events, run.motions.at, run.time, run.changes)
+        found.put(rows, _long_fates(catalogue, run.motions.rows(rows), onward[rows], slides))
+    return found
 
 
 def _slide_on(
