@@ -37,12 +37,19 @@ def in_contact_coordinates(structure: Structure) -> Structure:
     New coordinates are called "tangential" and "normal", with several contacts "tangential_0", "normal_0", …; the others keep
     their names.
 
+    **Raises:** `ValueError` for several structures in one, as `jax.vmap` returns them.
+
     **Example:**
 
         >>> fj.in_contact_coordinates(structure) is structure
         True
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    if np.ndim(structure.mass) != 2:
+        raise ValueError(
+            f"This is not one structure but several, as `jax.vmap` returns them: its mass matrix has shape "
+            f"{np.shape(structure.mass)}. Take them one by one, by `jax.vmap` of the function that you called."
+        )
     if structure.contacts_at_coordinates:
         return structure
     x, places = transformation(structure)

@@ -211,10 +211,8 @@ def check_corners(scene: Scene, axes: Mapping[str, np.ndarray]) -> None:
 
 def scene_in_contact_coordinates(scene: Scene) -> Scene:
     """The same scene with the directions of all contacts as coordinates; itself, where they are coordinates already."""
-    structure = scene.structure
-    if structure.contacts_at_coordinates:
-        return scene
-    return dataclasses.replace(scene, structure=in_contact_coordinates(structure))
+    structure = in_contact_coordinates(scene.structure)
+    return scene if structure is scene.structure else dataclasses.replace(scene, structure=structure)
 
 
 def _refuse_other_than_numbers(what: str, part: eqx.Module) -> None:

@@ -857,3 +857,19 @@ def test_names_of_two_parts_of_a_state():
     scene = fj.Scene(_with_a_parameter("x", coordinates=["x", "y"]), fj.Coulomb(0.2), 0.3, fj.ConstantLoad(1.0))
     with refused(ValueError, "Axis `x`", "a parameter of the scene"):
         fj.basins(scene, x=[0.9, 1.1], dx=[0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda scene: fj.simulate(scene, 0.1),
+        fj.limit_cycle,
+        fj.cea.growth_rate,
+        lambda scene: fj.cea.critical_friction(scene.structure),
+    ],
+)
+def test_several_scenes_in_one_are_refused_with_the_way_to_take_them(paper_scene, ask):
+    with jax.enable_x64(True):
+        scenes = jax.vmap(lambda mu: paper_scene.replace(mu=mu))(np.array([0.1, 0.2]))
+    with refused(ValueError, "(2, 3, 3)", "`jax.vmap`"):
+        ask(scenes)
