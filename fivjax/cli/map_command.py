@@ -89,7 +89,8 @@ class Map:
             )
         if begun and not asked:
             raise ValueError(
-                f"An interrupted map is kept in {_listed(begun)}. Go on with it by `--resume`, or delete that to begin anew."
+                f"A map is kept in {_listed(begun)}, which was interrupted, or which another process is computing. Go on with "
+                f"it by `--resume`, or delete that to begin anew."
             )
         scene, method = self.scene.scene(), self.method.stepper()
         # What draws is imported while kernels are compiled and run, which leaves Python to it.
