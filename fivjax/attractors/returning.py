@@ -1,6 +1,6 @@
 """Motions that come to tubes: whether all that starts on a tube's edge comes back to it, and which motions have come home."""
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,12 +9,6 @@ from ..section.return_maps import ReturnMaps, Section, section_at
 from . import tube
 from .motions import Motions
 from .tube import Tube
-
-if TYPE_CHECKING:
-    from .approach import Approach
-    from .tori import Torus
-
-Tubular = TypeVar("Tubular", "Torus", "Approach")
 
 # Starts on a tube's edge are back when they are in this share of it, which is less than what captures: next to a slow fade
 # there is a direction in which they come back hardly at all.
@@ -81,6 +75,16 @@ def starts_at(maps: ReturnMaps, group: Int[np.ndarray, " s"], states: list[Float
 def _constraints(maps: ReturnMaps) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " c"]]:
     """The section's weights of velocities, in weighted coordinates, and the indices of the normal displacements."""
     return maps.section / maps.weights[maps.structure.size :], np.atleast_1d(maps.normal)
+
+
+class HasTube(Protocol):
+    """What captures by a tube: a torus, or the approach to a cycle."""
+
+    @property
+    def tube(self) -> Tube: ...
+
+
+Tubular = TypeVar("Tubular", bound=HasTube)
 
 
 def captured_by_tubes(

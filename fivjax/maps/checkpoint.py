@@ -77,6 +77,11 @@ class Checkpoint:
 
     def _locked(self) -> RunLock | None:
         """The lock on the run; none where no folder can be made for it (a full disk)."""
+        if self._jobs.exists() and not self._jobs.is_dir():
+            raise ValueError(
+                f"File `{self._jobs}` is where the jobs of checkpoint `{self.path}` are kept, in a folder. Move it, or give "
+                f"another path for the checkpoint."
+            )
         with contextlib.suppress(OSError):
             self._jobs.mkdir(exist_ok=True)
             return RunLock(self._jobs, f"Checkpoint `{self.path}`")

@@ -92,9 +92,9 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         to_modal=inverse,
         from_modal=from_modal,
         regular=well_conditioned,
-        pressing=np.einsum("g...m,gmk->g...k", linear.pressing, from_modal),
-        slip=np.einsum("g...m,gmk->g...k", linear.slip, from_modal),
-        remainder=np.einsum("gkm,g...m->g...k", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
+        pressing=_of_modes(linear.pressing, from_modal),
+        slip=_of_modes(linear.slip, from_modal),
+        remainder=_in_modes(np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
         envelope=envelope(eigenvalues, _clusters(eigenvalues)),
         slowest_period=_slowest_period(eigenvalues),
         stable=regular & (decays | undamped),
@@ -109,6 +109,20 @@ def _condition(eigenvalues: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     half = vectors.shape[-1] // 2
     scaled = np.concatenate([vectors[:, :half] * typical[:, None, None], vectors[:, half:]], axis=1)
     return np.linalg.cond(scaled / np.linalg.norm(scaled, axis=1, keepdims=True))
+
+
+def _of_modes(
+    rows: Float[np.ndarray, "groups *contacts m"], from_modal: Complex[np.ndarray, "groups m k"]
+) -> Complex[np.ndarray, "groups *contacts k"]:
+    """The shares of the modes in these functions of the state, given by their derivatives."""
+    return np.einsum("g...m,gmk->g...k", rows, from_modal)
+
+
+def _in_modes(
+    to_modal: Complex[np.ndarray, "groups k m"], columns: Float[np.ndarray, "groups *contacts m"]
+) -> Complex[np.ndarray, "groups *contacts k"]:
+    """These directions of the state in modal coordinates."""
+    return np.einsum("gkm,g...m->g...k", to_modal, columns)
 
 
 def _slowest_period(eigenvalues: np.ndarray) -> np.ndarray:

@@ -234,6 +234,13 @@ def test_what_is_no_checkpoint_is_refused_and_left_alone(paper_scene, tmp_path):
         assert path.read_bytes() == before
 
 
+def test_a_file_where_jobs_are_kept_is_refused_and_left_alone(paper_scene, tmp_path):
+    (tmp_path / "map.part.jobs").write_text("notes")
+    with pytest.raises(ValueError, match=r"map\.part\.jobs` is where the jobs of checkpoint"):
+        fj.bistability_map(paper_scene, progress=False, resume=tmp_path / "map.part", **AXES)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("map.part.jobs", "notes")]
+
+
 def test_the_command_does_not_overwrite_an_interrupted_map(tmp_path, capsys, monkeypatch):
     """A map begun anew without a word would throw away what the interrupted one had finished."""
     monkeypatch.setattr("fivjax.cli.command_line.keep_compiled_code", lambda: None)
