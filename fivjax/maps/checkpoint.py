@@ -153,7 +153,7 @@ class Checkpoint:
 
     def close(self) -> None:
         """Release the lock, and remove the folder of jobs under way if there are none."""
-        if len(self._places) == self.total and not self._more:
+        if len(self._places) == self.total and not self._new:
             shutil.rmtree(self._jobs, ignore_errors=True)
         self._release()
 
