@@ -25,10 +25,8 @@ from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
 from .critical_derivatives import differentiable, with_derivatives
-from .narrowing import AT_ENDS, Kicked, Scan
+from .narrowing import AT_ENDS, Kicked, Scan, checked_range
 
-# The steps of a scan, unless given.
-P_STEP = 0.01
 # Names in the dataset of critical kicks, beside those of maps.
 OF_RESULTS = (
     *("p_crit_low", "p_crit_high", "p_crit_error", "crossings", "only_crossing", "critical_energy", "kick_work"),
@@ -121,7 +119,7 @@ def critical_perturbation(
         name = "belt_speed" if np.ndim(scene.belt_speed) == 0 else "force"
         axis = {name: np.asarray(scene.parameters[name])[None]}
     arguments.real_number("tolerance", tolerance, above=0)
-    low, high, p_step, scanned = _checked_range(p_range, p_step)
+    low, high, p_step, scanned = checked_range(p_range, p_step)
     check_size({**axis, "p": range(scanned)}, energy=bool(energy))
     axes = checked_axes(scene, axis)
     check_axis_names(axes, OF_RESULTS, "critical kicks")
@@ -164,20 +162,6 @@ def critical_perturbation(
     return labelled(
         dataset, scene, method=describe_method(method), **time_limit(t_max), tolerance=tolerance, p_step=p_step
     )
-
-
-def _checked_range(p_range, p_step: float | None) -> tuple[float, float, float, int]:
-    """The ends of the range of p, the steps of its scan, and how many kicks there are in it."""
-    if not isinstance(p_range, tuple | list) or len(p_range) != 2:
-        kind = TypeError if not isinstance(p_range, tuple | list) else ValueError
-        raise kind(f"Argument `p_range` must be a pair of numbers, such as (1.0, 5.0), but is {p_range!r}.")
-    low, high = p_range
-    arguments.real_number("p_range[0]", low, minimum=0)
-    arguments.real_number("p_range[1]", high, above=low)
-    if p_step is None:
-        p_step = min(P_STEP, float(high) - float(low))
-    arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
-    return low, high, p_step, round(min((high - low) / p_step, 1e15)) + 1
 
 
 def _stepping_error(

@@ -1,10 +1,12 @@
 """Brackets of critical kicks: the scan of a range of kicks, and brackets that are narrowed, by verdicts of trajectories."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..foundation import arguments
 from ..maps.crossing import FirstCrossing, first_crossings, with_ends
 from ..maps.engine import RunOptions, run_to_verdict
 from ..maps.groups import Limits
@@ -15,6 +17,22 @@ from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
 
 AT_ENDS = (Verdict.SLIDING, Verdict.LIMIT_CYCLE)
+# The steps of a scan, unless given.
+P_STEP = 0.01
+
+
+def checked_range(p_range, p_step: float | None) -> tuple[float, float, float, int]:
+    """The ends of the range of p, the steps of its scan, and how many kicks there are in it."""
+    if not isinstance(p_range, tuple | list) or len(p_range) != 2:
+        kind = TypeError if not isinstance(p_range, tuple | list) else ValueError
+        raise kind(f"Argument `p_range` must be a pair of numbers, such as (1.0, 5.0), but is {p_range!r}.")
+    low, high = p_range
+    arguments.real_number("p_range[0]", low, minimum=0)
+    arguments.real_number("p_range[1]", high, above=low)
+    if p_step is None:
+        p_step = min(P_STEP, float(high) - float(low))
+    arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
+    return low, high, p_step, round(min((high - low) / p_step, 1e15)) + 1
 
 
 class Kicked(NamedTuple):
@@ -122,3 +140,23 @@ class Scan(NamedTuple):
         """Where there is at most one change, and no undecided kick outside its bracket that might hide another."""
         inside, no_kick = (self.p > self.seen.low[:, None]) & (self.p < self.seen.high[:, None]), self.p == 1.0
         return (self.seen.changes <= 1) & ~np.any((self.verdicts < 0) & ~inside & ~no_kick, axis=1)
+
+
+def least_crossings(kicked: Kicked, p: Float[np.ndarray, " kicks"], tolerance: float, wanted: int) -> FirstCrossing:
+    """The first crossings of those scenes whose are the smallest, `wanted` of them or more, narrowed to the tolerance; NaN for
+    the others. Kicks far above the smallest that lead to a limit cycle need no verdict.
+    """
+    rows = len(next(iter(kicked.columns.values())))
+    found = FirstCrossing(*np.full((3, rows), np.nan), np.zeros(rows, int))
+    left, begin = np.arange(rows), 0
+    for share in (1 / 8, 1 / 4, 1 / 2, 1):
+        end = max(begin + 2, math.ceil(share * len(p)))
+        own = kicked.only(left)
+        scan = Scan.of(own, p[begin:end])
+        fine, _ = own.narrowed(*scan.brackets, tolerance)
+        for whole, part in zip(found, fine, strict=True):
+            whole[left] = part
+        left, begin = left[np.isnan(scan.seen.high)], end - 1
+        if not len(left) or end >= len(p) or np.sum(np.isfinite(found.middle)) >= wanted:
+            break
+    return found

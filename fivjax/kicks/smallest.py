@@ -22,12 +22,16 @@ from ..foundation.digits import apart
 from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
-from ..maps.groups import OF_KICK
+from ..maps.axes import check_size
+from ..maps.engine import RunOptions
+from ..maps.groups import OF_KICK, Limits
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import weights_of
+from ..steppers.event_exact import EXACT_STEPPER
 from ..verdicts.sliding_proof import envelope_peak
 from .critical import critical_perturbation
+from .narrowing import Kicked, checked_range, least_crossings
 from .perturbations import Histories, InitialStates, stable_sliding
 from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, dataset_of, smallest_of
 from .stable_manifold import Saddle, critical_kick, saddle_of
@@ -39,6 +43,8 @@ if TYPE_CHECKING:
 GRID, STARTS = 4096, 24
 # Steps of a search; and the derivative of p_crit that counts as zero, relative to p - 1 per duration.
 MOST_STEPS, LEVEL = 100, 1e-9
+# To which crossings are narrowed before the searches begin.
+TOLERANCE = 1e-5
 
 
 class SmallestKick(NamedTuple):
@@ -191,31 +197,31 @@ def smallest_kick(
     shortest, longest = given["duration"] if "duration" in free else (own, own)
     certified = 1.0 + certified_excess(scene, float(shortest), float(longest))
     starts = _nominated(scene, float(shortest), float(longest)) if "duration" in free else np.array([own])
-    scanned = critical_perturbation(
-        scene, duration=starts, p_range=tuple(map(float, given["p"])), p_step=p_step, progress=False
-    )
-    if not np.any(np.isfinite(scanned["p_crit"])):
+    low, high, _, scanned = checked_range(tuple(map(float, given["p"])), p_step)
+    check_size({"duration": starts, "p": range(scanned)})
+    options = RunOptions("scan", progress=False, all_or_none=True)
+    kicked = Kicked(scene, {"duration": starts}, EXACT_STEPPER, Limits(None), options, {})
+    seen = least_crossings(kicked, np.linspace(low, high, scanned), TOLERANCE, descents)
+    known = np.flatnonzero(np.isfinite(seen.middle))
+    if not len(known):
         raise NoSquealingKick(
             f"No kick with p up to {given['p'][1]:g} that was tried leads to a limit cycle. Raise `bounds`, or scan more "
             f"finely.",
             certified,
         )
-    best = int(np.nanargmin(scanned["p_crit"]))
-    row = scanned.isel(duration=best)
-    p, duration = float(row["p_crit"]), float(starts[best])
+    tried = sorted((float(seen.middle[k]), float(starts[k]), int(k)) for k in known)[:descents]
+    p, duration, best = tried[0]
     if "duration" in free:
-        order = np.argsort(np.where(np.isfinite(scanned["p_crit"]), scanned["p_crit"], np.inf))[:descents]
-        tried = [(float(scanned["p_crit"][k]), float(starts[k])) for k in order if np.isfinite(scanned["p_crit"][k])]
-        p, duration = min(_descended(scene, *one, float(shortest), float(longest)) for one in tried)
+        p, duration = min(_descended(scene, *one, float(shortest), float(longest)) for *one, _ in tried)
     at = critical_perturbation(
         scene, duration=[duration], p_range=(p - 1e-4, p + 1e-4), p_step=1e-4, derivatives=True, progress=False
     ).isel(duration=0)
     # Where its lower end squeals already, the guess was too far off to say how small a kick may be.
     if np.isfinite(at["p_crit_low"]):
-        row, p = at, float(at["p_crit"])
+        p, proved = float(at["p_crit"]), (float(at["p_crit_low"]), float(at["p_crit_high"]))
     else:
-        duration, p = float(starts[best]), float(row["p_crit"])
-    return SmallestKick(p, duration, certified, float(row["p_crit_low"]), float(row["p_crit_high"]), scene)
+        (p, duration, _), proved = tried[0], (float(seen.low[best]), float(seen.high[best]))
+    return SmallestKick(p, duration, certified, *proved, scene)
 
 
 def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], pieces: int) -> SmallestPerturbation:
