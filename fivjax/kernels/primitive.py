@@ -52,16 +52,16 @@ def _values_jvp(function, form: Form, primals, tangents):
         _bind(function, form, arrays, instants, wide, width, directions[:, start : start + width])
         for start in range(0, total, width)
     ]
-    kernel, (ends, rows, *_) = _Hashed(kernel_of(function, form, wide, width)), of_parts[0]
+    kernel, (ends, rows, *_) = kernel_of(function, form, wide, width), of_parts[0]
     slopes = [own for _, _, *own in of_parts]
     return (ends, rows), _tangents(kernel, ends.shape[-1], rows.shape[-1], instants.shape[-1], slopes, moving)
 
 
 # One program: outside of others each operation would be one of its own.
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _tangents(kernel: "_Hashed", ends: int, rows: int, count: int, parts: list, moving: list):
+def _tangents(kernel: Kernel, ends: int, rows: int, count: int, parts: list, moving: list):
     """The tangents of so many numbers at the end and in rows, from those by each number that is perturbed."""
-    code, ways = kernel.kernel.text, jnp.concatenate([jnp.ravel(dot) for dot in moving])
+    code, ways = kernel.text, jnp.concatenate([jnp.ravel(dot) for dot in moving])
     of_ends, of_rows = (jnp.concatenate(own, axis=-1)[..., : len(ways)] @ ways for own in zip(*parts, strict=True))
     return (
         _spread(ends, of_ends, code.ends, code.end_dots, 1),
@@ -88,30 +88,17 @@ def is_real(array) -> bool:
 
 def _bind(function, form: Form, arrays: Sequence, instants, wide: tuple[bool, ...], width: int, directions):
     dots = jnp.zeros((1, 1)) if directions is None else jnp.asarray(directions)
-    kernel = _Hashed(kernel_of(function, form, wide, width))
+    kernel = kernel_of(function, form, wide, width)
     return kernel_p.bind(dots, jnp.asarray(instants), *map(jnp.asarray, arrays), kernel=kernel)
-
-
-class _Hashed:
-    """A kernel as a parameter of the primitive."""
-
-    def __init__(self, kernel: Kernel):
-        self.kernel = kernel
-
-    def __eq__(self, other) -> bool:
-        return self.kernel is other.kernel
-
-    def __hash__(self) -> int:
-        return id(self.kernel)
 
 
 kernel_p = Primitive("fivjax_kernel")
 kernel_p.multiple_results = True
 
 
-def _batch_of(kernel: _Hashed, arrays: Sequence) -> tuple[int, ...]:
+def _batch_of(kernel: Kernel, arrays: Sequence) -> tuple[int, ...]:
     """The leading axes that all arrays have alike, over trajectories."""
-    return arrays[0].shape[: arrays[0].ndim - len(kernel.kernel.form.arrays[0].shape)]
+    return arrays[0].shape[: arrays[0].ndim - len(kernel.form.arrays[0].shape)]
 
 
 def _in_rows(arrays: Sequence, lanes: int, xp):
@@ -120,25 +107,25 @@ def _in_rows(arrays: Sequence, lanes: int, xp):
 
 
 @kernel_p.def_abstract_eval
-def _abstract(dots, instants, *arrays, kernel: _Hashed):
-    shapes = kernel.kernel.shapes(_batch_of(kernel, arrays), instants.shape[-1])
+def _abstract(dots, instants, *arrays, kernel: Kernel):
+    shapes = kernel.shapes(_batch_of(kernel, arrays), instants.shape[-1])
     return [jax.core.ShapedArray(shape, np.dtype("float64")) for shape in shapes]
 
 
 @kernel_p.def_impl
-def _known(dots, instants, *arrays, kernel: _Hashed):
+def _known(dots, instants, *arrays, kernel: Kernel):
     dots, instants, *arrays = map(np.asarray, (dots, instants, *arrays))
     batch = _batch_of(kernel, arrays)
     if 0 in batch:
-        return [jax.device_put(np.zeros(shape)) for shape in kernel.kernel.shapes(batch, instants.shape[-1])]
-    found = kernel.kernel.launched(
+        return [jax.device_put(np.zeros(shape)) for shape in kernel.shapes(batch, instants.shape[-1])]
+    found = kernel.launched(
         _in_rows(arrays, math.prod(batch), np), instants.reshape(-1, instants.shape[-1]), dots[None]
     )
     return [jax.device_put(part.reshape(batch + part.shape[1:])) for part in found]
 
 
 @own_settings()
-def _batched(operands, axes, *, kernel: _Hashed):
+def _batched(operands, axes, *, kernel: Kernel):
     (dots, instants, *arrays), (of_dots, of_instants, *of_arrays) = operands, axes
     size = next(part.shape[axis] for part, axis in zip(operands, axes, strict=True) if axis is not None)
     if of_dots is not None:
@@ -163,7 +150,7 @@ batching.primitive_batchers[kernel_p] = _batched
 
 
 @own_settings()
-def _second_derivative(primals, tangents, *, kernel: _Hashed):
+def _second_derivative(primals, tangents, *, kernel: Kernel):
     """Derivatives of what a kernel finds, tangents included."""
     (dots, instants, *arrays), (of_dots, of_instants, *of_arrays) = map(jnp.asarray, primals), tangents
     if not isinstance(of_dots, ad.Zero) or not isinstance(of_instants, ad.Zero):
@@ -178,22 +165,21 @@ def _second_derivative(primals, tangents, *, kernel: _Hashed):
 ad.primitive_jvps[kernel_p] = _second_derivative
 
 
-def _by_kernel_with_slopes(kernel: _Hashed, dots, instants, *arrays) -> list:
+def _by_kernel_with_slopes(kernel: Kernel, dots, instants, *arrays) -> list:
     """What a kernel finds, so that its tangents have derivatives: by the kernel of a function that gives both."""
-    own = kernel.kernel
     if _batch_of(kernel, arrays):
         axes = None, 0 if instants.ndim > 1 else None, *(0 for _ in arrays)
         return jax.vmap(functools.partial(_by_kernel_with_slopes, kernel), axes)(dots, instants, *arrays)
-    wide = list(compress(own.form.arrays, own.wide))
-    function, form = own.function.with_slopes, form_with_slopes(own.form, own.wide)
+    wide = list(compress(kernel.form.arrays, kernel.wide))
+    function, form = kernel.function.with_slopes, form_with_slopes(kernel.form, kernel.wide)
     ends, rows = jax.vmap(lambda dot: values(function, form, (*arrays, *_arrays(wide, dot)), instants), 1, 1)(dots)
     found, slopes, count = [], [], instants.shape[-1]
-    for numbers, places, repeated in ((ends, own.text.ends, 1), (rows, own.text.rows, count)):
+    for numbers, places, repeated in ((ends, kernel.text.ends, 1), (rows, kernel.text.rows, count)):
         # What is found, and then its slopes.
         size = repeated * sum(place.size for place in places)
         found.append(numbers[:size, 0])
         slopes.append(numbers[size:])
-    parts = zip((*found, *slopes), own.shapes((), count), strict=True)
+    parts = zip((*found, *slopes), kernel.shapes((), count), strict=True)
     # A row that has no numbers is one zero.
     return [part if part.shape == shape else jnp.zeros(shape) for part, shape in parts]
 
@@ -205,9 +191,9 @@ def _arrays(like: Sequence[ArrayForm], numbers) -> list:
 
 
 @own_settings()
-def _lowered(dots, instants, *arrays, kernel: _Hashed):
+def _lowered(dots, instants, *arrays, kernel: Kernel):
     batch = _batch_of(kernel, arrays)
-    shapes, lanes = kernel.kernel.shapes(batch, instants.shape[-1]), math.prod(batch)
+    shapes, lanes = kernel.shapes(batch, instants.shape[-1]), math.prod(batch)
     if not lanes:
         return list(map(jnp.zeros, shapes))
     flat = _in_rows(arrays, lanes, jnp), dots[None], instants.reshape(-1, instants.shape[-1])
@@ -217,16 +203,16 @@ def _lowered(dots, instants, *arrays, kernel: _Hashed):
 
 
 @functools.cache
-def _callable(kernel: _Hashed):
+def _callable(kernel: Kernel):
     """A function of JAX arrays that launches the kernel."""
 
     def launch(places: Addresses) -> None:
         for address, shape in places[len(GIVEN) :]:
             ctypes.memset(address, 0, math.prod(shape) * np.dtype(np.float64).itemsize)
-        kernel.kernel.launch(places)
+        kernel.launch(places)
 
     # XLA may keep a program for other processes, where the same name has to mean the same.
-    digest = hashlib.sha256(kernel.kernel.of_lanes.body.encode()).hexdigest()
+    digest = hashlib.sha256(kernel.of_lanes.body.encode()).hexdigest()
     return called_by_xla(f"fivjax_kernel_{digest}", launch)
 
 
