@@ -51,8 +51,7 @@ class KernelFunction:
         form, common, each = _parts(args, own)
         known = all(map(is_known, (*common, instants)))
         if not by_kernel:
-            run = self._of_each_by_xla if own else self._by_xla
-            found = run(form, *_typed(form, common, each), instants)
+            found = self._by_xla(form, *_typed(form, common, each), instants)
             return jax.tree.map(known_to_numpy, found) if known else found
         if known:
             found = self.of_many(form, _rows(common, each), np.asarray(instants))
@@ -71,8 +70,7 @@ class KernelFunction:
         form, common, each = _parts(args, own)
         dots = [np.asarray(dot, float) for dot in Form.of(directions)[1]]
         if not by_kernel:
-            run = self._derived_of_each_by_xla if own else self._derived_by_xla
-            found, slopes = run(form, *_typed(form, common, each), dots, instants)
+            found, slopes = self._by_xla(form, *_typed(form, common, each), instants, dots)
             return jax.tree.map(known_to_numpy, found), jax.tree.map(known_to_numpy, slopes)
         wide = tuple(is_real(array) and bool(np.any(dot)) for array, dot in zip(form.arrays, dots, strict=True))
         total = dots[0].shape[-1]
@@ -144,27 +142,18 @@ class KernelFunction:
             raise NotImplementedError("Kernels have no third derivatives; take differences of second ones.")
         return KernelFunction(functools.partial(with_slopes, self.differentiated))
 
-    # Without kernels.
-
     @functools.cached_property
     def _by_xla(self):
-        return compiled(lambda form, common, each, instants: self.function(form.args(common), instants))
+        """Without kernels: the results, or with directions their derivatives, too."""
 
-    @functools.cached_property
-    def _of_each_by_xla(self):
-        def run(form: Form, common, each, instants):
-            return jax.vmap(lambda own: self.function(form.args([*common, *own]), instants))(each)
+        def run(form: Form, common, each, instants, dots=None):
+            def one(own):
+                arrays = [*common, *own]
+                if dots is None:
+                    return self.function(form.args(arrays), instants)
+                return self._along_each(form, arrays, dots, instants)
 
-        return compiled(run)
-
-    @functools.cached_property
-    def _derived_by_xla(self):
-        return compiled(lambda form, common, each, dots, instants: self._along_each(form, common, dots, instants))
-
-    @functools.cached_property
-    def _derived_of_each_by_xla(self):
-        def run(form: Form, common, each, dots, instants):
-            return jax.vmap(lambda own: self._along_each(form, [*common, *own], dots, instants))(each)
+            return jax.vmap(one)(each) if each else one([])
 
         return compiled(run)
 
