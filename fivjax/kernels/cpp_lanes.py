@@ -90,12 +90,11 @@ static inline reals log(const reals x) {
 def declarations(lanes: int) -> str:
     """The types of so many lanes' numbers, their functions, and arrays that have a row for each lane."""
     lines = [
-        f"typedef double reals __attribute__((ext_vector_type({lanes})));",
+        "typedef double reals __attribute__((ext_vector_type(LANES)));",
         "typedef decltype(reals() < reals()) truths;",
         "typedef truths wholes;",
-        _each(
-            "bool any(const truths which)", "long long found = 0;", "found |= which[l];", "return found != 0;", lanes
-        ),
+        "static inline bool any(const truths which) {"
+        " long long found = 0; for (int l = 0; l < LANES; ++l) found |= which[l]; return found != 0; }",
         *(_of_numbers(name, ("x",), f"::{name}") for name in OF_ONE if name not in BY_VECTORS),
         *(_of_numbers(name, ("x", "y"), f"::{name}") for name in OF_TWO),
         *(_of_numbers(name, ("x",), f"__builtin_{name}") for name in ("log1p", "expm1")),
@@ -106,28 +105,24 @@ def declarations(lanes: int) -> str:
         "  return (x > (T)(0) ? (T)(1) : (x < (T)(0) ? (T)(-1) : x)); }",
         # Numbers at places of arrays that differ from lane to lane.
         "template <class T> static inline T picked(const T* all, const wholes at) {",
-        f"  T found; for (int l = 0; l < {lanes}; ++l) found[l] = all[at[l]][l]; return found; }}",
+        "  T found; for (int l = 0; l < LANES; ++l) found[l] = all[at[l]][l]; return found; }",
         "static inline reals picked(const double* all, const wholes at) {",
-        f"  reals found; for (int l = 0; l < {lanes}; ++l) found[l] = all[at[l]]; return found; }}",
+        "  reals found; for (int l = 0; l < LANES; ++l) found[l] = all[at[l]]; return found; }",
         "static inline wholes picked(const int* all, const wholes at) {",
-        f"  wholes found; for (int l = 0; l < {lanes}; ++l) found[l] = all[at[l]]; return found; }}",
+        "  wholes found; for (int l = 0; l < LANES; ++l) found[l] = all[at[l]]; return found; }",
         "template <class T> static inline void put(T* all, const wholes at, const T own) {",
-        f"  for (int l = 0; l < {lanes}; ++l) all[at[l]][l] = own[l]; }}",
+        "  for (int l = 0; l < LANES; ++l) all[at[l]][l] = own[l]; }",
         "template <class T> static inline void add(T* all, const wholes at, const T own) {",
-        f"  for (int l = 0; l < {lanes}; ++l) all[at[l]][l] += own[l]; }}",
+        "  for (int l = 0; l < LANES; ++l) all[at[l]][l] += own[l]; }",
         # Each lane's own row.
-        f"struct Rows {{ const double* of[{lanes}]; reals operator[](const long long at) const {{",
-        f"  reals found; for (int l = 0; l < {lanes}; ++l) found[l] = of[l][at]; return found; }} }};",
+        "struct Rows { const double* of[LANES]; reals operator[](const long long at) const {",
+        "  reals found; for (int l = 0; l < LANES; ++l) found[l] = of[l][at]; return found; } };",
         "struct Written { double* of; long long step, at; int lanes; void operator=(const reals own) const {",
         "  for (int l = 0; l < lanes; ++l) of[l * step + at] = own[l]; } };",
         "struct NewRows { double* of; long long step; int lanes; Written operator[](const long long at) const {",
         "  return {of, step, at, lanes}; } };",
     ]
-    return "\n".join(line.replace("LANES", str(lanes)) for line in lines)
-
-
-def _each(head: str, begin: str, one: str, end: str, lanes: int) -> str:
-    return f"static inline {head} {{ {begin} for (int l = 0; l < {lanes}; ++l) {one} {end} }}"
+    return "\n".join(lines).replace("LANES", str(lanes))
 
 
 def _of_numbers(name: str, numbers: tuple[str, ...], own: str) -> str:
