@@ -4,18 +4,17 @@ import dataclasses
 import functools
 import re
 from collections.abc import Callable, Sequence
-from itertools import compress
+from itertools import chain, compress, pairwise, starmap
 
 import jax
 import numpy as np
-from jax.extend.core import Literal
 from jax.interpreters import partial_eval
 
 from ..foundation.argument_forms import Form
 from ..foundation.jaxprs import of_scan
 from ..foundation.plain_trees import from_text, structure_to_text
 from ..foundation.precision import own_settings
-from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers
+from .cpp_arrays import Value, View, count_of, has_known_numbers, natural
 from .cpp_code import writer
 from .cpp_lanes import OF_LANES, REALS
 from .cpp_loops import scan
@@ -169,9 +168,9 @@ class _WriterOfKernel:
 
     def __init__(self, jaxpr, shared: int, given: int, lengths, lanes: bool):
         self.jaxpr, self.shared, self.given = jaxpr, shared, given
-        self.ends, self.rows, self.end_dots, self.row_dots = (
-            jaxpr.outvars[start:end] for start, end in zip([0, *lengths], [*lengths, None], strict=True)
-        )
+        # Of the results: those at the end, those in rows, and the tangents of both.
+        self.parts = list(starmap(slice, pairwise([0, *lengths, None])))
+        _, self.rows, _, self.row_dots = (jaxpr.outvars[part] for part in self.parts)
         self.kind = REALS if lanes else "double"
         names = ("shared", "given", "instants", "rows")
         self.writer = writer({**dict.fromkeys(names, self.kind), "dots": WIDE, "row_dots": WIDE}, lanes)
@@ -184,33 +183,25 @@ class _WriterOfKernel:
             raise NotImplementedError(
                 "A kernel's function must go along its instants by one `scan`, and use them nowhere else."
             )
-        known: dict = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
         shared, given, dots = numbers[: self.shared], numbers[self.shared : self.given], numbers[self.given :]
-        for name, own in (("shared", shared), ("given", given), ("dots", dots)):
-            known |= dict(zip(own, _given(writer, name, own), strict=True))
-        known[instants] = View("instants", (0,), (2,), (1,), self.kind)
+        own = (_given(writer, name, own) for name, own in (("shared", shared), ("given", given), ("dots", dots)))
+        begin = [*chain(*own), View("instants", (0,), (2,), (1,), self.kind)]
 
-        def read(atom) -> Value:
-            return of_numbers(atom.val) if isinstance(atom, Literal) else known[atom]
-
-        for equation in jaxpr.eqns:
-            operands = list(map(read, equation.invars))
+        def applied(equation, operands: list[Value]) -> list[Value]:
             if equation in loops:
-                found = scan(writer, equation, operands, "count", functools.partial(self._rows_of, equation))
-            else:
-                found = writer.applied(equation, operands)
-            known.update(zip(equation.outvars, found, strict=True))
+                return scan(writer, equation, operands, "count", functools.partial(self._rows_of, equation))
+            return writer.applied(equation, operands)
+
+        found = writer.run(jaxpr, consts, begin, applied)
+        ends, rows, end_dots, row_dots = (found[part] for part in self.parts)
         along = {variable for loop in loops for variable in loop.outvars[of_scan(loop.params)[1] :]}
-        for variable in (*self.rows, *self.row_dots):
+        for variable, value in zip((*self.rows, *self.row_dots), (*rows, *row_dots), strict=True):
             # Tangents that do not depend on what is perturbed are zero, as their array is from the start.
-            if variable not in along and not (has_known_numbers(read(variable)) and not np.any(read(variable))):
+            if variable not in along and not (has_known_numbers(value) and not np.any(value)):
                 raise NotImplementedError("Rows of a kernel's function must be results of its `scan`.")
-        for name, variables, kind in (("ends", self.ends, self.kind), ("end_dots", self.end_dots, WIDE)):
-            start = 0
-            for variable in variables:
-                for entry in writer.entries(read(variable)).ravel():
-                    writer.put(f"{name}[{start}] = {writer.as_type(entry, kind)};")
-                    start += 1
+        for name, values, kind in (("ends", ends, self.kind), ("end_dots", end_dots, WIDE)):
+            for start, entry in enumerate(chain(*(writer.entries(value).ravel() for value in values))):
+                writer.put(f"{name}[{start}] = {writer.as_type(entry, kind)};")
         return _loaded(writer.source, {"shared": shared, "given": given}) if writer.lanes else writer.source
 
     def _rows_of(self, loop, k: int, kind: str) -> View:

@@ -214,8 +214,8 @@ class Writer:
 
     # Equations.
 
-    def run(self, jaxpr: Jaxpr, consts, given: Sequence[Value]) -> list[Value]:
-        """The results of a traced function."""
+    def run(self, jaxpr: Jaxpr, consts, given: Sequence[Value], applied: Callable | None = None) -> list[Value]:
+        """The results of a traced function, whose equations are written by `applied` if that is said."""
         known: dict = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
         known.update(zip(jaxpr.invars, given, strict=True))
 
@@ -223,7 +223,7 @@ class Writer:
             return of_numbers(atom.val) if isinstance(atom, Literal) else known[atom]
 
         for equation in jaxpr.eqns:
-            results = self.applied(equation, list(map(read, equation.invars)))
+            results = (applied or self.applied)(equation, list(map(read, equation.invars)))
             known.update(zip(equation.outvars, results, strict=True))
         return list(map(read, jaxpr.outvars))
 
