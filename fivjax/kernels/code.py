@@ -14,12 +14,14 @@ from ..foundation.argument_forms import Form
 from ..foundation.jaxprs import of_scan
 from ..foundation.plain_trees import from_text, structure_to_text
 from ..foundation.precision import own_settings
+from . import cpp_elimination, cpp_loops, cpp_places, cpp_reductions
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural
-from .cpp_code import writer
 from .cpp_lanes import OF_LANES, REALS
-from .cpp_loops import scan
 from .cpp_numbers import WIDE, converted, kind_of
 from .cpp_writer import Writer
+
+# Everything that is known of primitives, together.
+RULES = cpp_places.RULES | cpp_reductions.RULES | cpp_loops.RULES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,7 +175,8 @@ class _WriterOfKernel:
         _, self.rows, _, self.row_dots = (jaxpr.outvars[part] for part in self.parts)
         self.kind = REALS if lanes else "double"
         names = ("shared", "given", "instants", "rows")
-        self.writer = writer({**dict.fromkeys(names, self.kind), "dots": WIDE, "row_dots": WIDE}, lanes)
+        types = {**dict.fromkeys(names, self.kind), "dots": WIDE, "row_dots": WIDE}
+        self.writer = Writer(RULES, cpp_elimination.CALLS, types, lanes)
 
     def source(self, consts) -> str:
         writer, jaxpr = self.writer, self.jaxpr
@@ -189,7 +192,7 @@ class _WriterOfKernel:
 
         def applied(equation, operands: list[Value]) -> list[Value]:
             if equation in loops:
-                return scan(writer, equation, operands, "count", functools.partial(self._rows_of, equation))
+                return cpp_loops.scan(writer, equation, operands, "count", functools.partial(self._rows_of, equation))
             return writer.applied(equation, operands)
 
         found = writer.run(jaxpr, consts, begin, applied)

@@ -48,8 +48,8 @@ class Writer:
         self,
         rules: Mapping[str, Callable],
         calls: Mapping[str, Callable],
-        types: dict[str, str] | None = None,
-        lanes: bool = False,
+        types: Mapping[str, str],
+        lanes: bool,
     ):
         """`rules` are functions that write primitives, `calls` those that write calls of functions, by name; `types` are those
         of the variables that the code is given. `lanes` is whether the code is for several lanes side by side (`cpp_lanes`).
@@ -61,7 +61,7 @@ class Writer:
         self.lines: list[str] = []
         # The texts of functions that the code calls, by name.
         self.functions: dict[str, str] = {}
-        self.types = dict(types or {})
+        self.types = dict(types)
         self._count = count()
         # Blocks that are open, each with what has been computed in it: the same text is the same number.
         self._blocks: list[dict] = [{}]
