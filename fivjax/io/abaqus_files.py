@@ -64,7 +64,6 @@ def _matrix_input(path: Path, text: str) -> FileMatrix:
             f"Write it again."
         )
     rows, columns = (_with_directions(part) for part in (labels[:, :count], labels[:, count:]))
-    numbers = np.array(numbers)
     if symmetric:
         kept, values = _one_of_each(place, rows, columns, values, numbers)
         rows, columns, values, numbers = rows[kept], columns[kept], values[kept], numbers[kept]

@@ -57,8 +57,8 @@ def frequency_response(given: Any) -> FrequencyResponse | None:
     return LowPass(float(cutoff), int(order))
 
 
-def memory(response: FrequencyResponse, step: float, left: float = 1e-6) -> float:
-    """How long a filter remembers, in s: the time beyond which its impulse response stays below `left` of its largest value.
+def memory(response: FrequencyResponse, step: float) -> float:
+    """How long a filter remembers, in s: the time beyond which its impulse response stays below 1e-6 of its largest value.
 
     Looked for among responses sampled every `step` (s) over up to four million steps.
     """
@@ -67,15 +67,15 @@ def memory(response: FrequencyResponse, step: float, left: float = 1e-6) -> floa
         impulse = np.abs(np.fft.irfft(response(np.fft.rfftfreq(count, step)), count))
         # What comes before the impulse, for filters without delay, is at the end.
         away = np.minimum(np.arange(count), count - np.arange(count))
-        heard = away[impulse > left * impulse.max()].max()
+        heard = away[impulse > 1e-6 * impulse.max()].max()
         if heard < count // 4 or count >= 1 << 22:
             return min(heard + 1, count // 4) * step
         count *= 2
 
 
-def bandwidth(response: FrequencyResponse, highest: float, left: float = 1e-3) -> float:
-    """The frequency (Hz) above which a filter passes less than `left` of its most; at most `highest`."""
+def bandwidth(response: FrequencyResponse, highest: float) -> float:
+    """The frequency (Hz) above which a filter passes less than a thousandth of its most; at most `highest`."""
     frequencies = np.linspace(0.0, highest, 4097)
     passed = np.abs(response(frequencies))
-    heard = np.flatnonzero(passed > left * passed.max())
+    heard = np.flatnonzero(passed > 1e-3 * passed.max())
     return float(frequencies[heard[-1]]) if heard.size and math.isfinite(passed.max()) else highest

@@ -19,9 +19,9 @@ from .lane_functions import AT_A_TIME, LaneFunction
 from .warp_library import gpus_for, warp
 from .xla_calls import Addresses
 
-# The arrays of every kernel, with their axes: over trajectories, then as said.
-GIVEN = {"given": 2, "dots": 3, "instants": 2}  # numbers; numbers and directions; instants
-FOUND = {"ends": 2, "rows": 2, "end_dots": 3, "row_dots": 3}
+# The arrays of every kernel. Their first axis is over trajectories; then come numbers or instants, and in `dots` directions.
+GIVEN = ("given", "dots", "instants")
+FOUND = ("ends", "rows", "end_dots", "row_dots")
 # A kernel is given the addresses of these arrays, the length of a row of numbers, the step from one row of instants to the
 # next, and the number of instants.
 SIZES = ("numbers", "step", "count")
