@@ -5,6 +5,7 @@ import functools
 import re
 from collections.abc import Callable, Sequence
 from itertools import chain, compress, pairwise, starmap
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -24,51 +25,42 @@ from .cpp_writer import Writer
 RULES = cpp_places.RULES | cpp_reductions.RULES | cpp_loops.RULES
 
 
-@dataclasses.dataclass(frozen=True)
-class Slot:
+class Slot(NamedTuple):
     """Where an array is in a row of numbers."""
 
     start: int
     shape: tuple[int, ...]
     dtype: str
 
-    @functools.cached_property
+    @property
     def size(self) -> int:
         return count_of(self.shape)
 
-    @functools.cached_property
-    def is_real(self) -> bool:
-        return np.issubdtype(np.dtype(self.dtype), np.floating)
-
-    def slopes(self, dots, count: int | None = None):
-        """The derivatives of the array along directions (the last axis), in such rows of directions; or of so many of it."""
+    def of(self, numbers, count: int | None = None, after: int = 0):
+        """The array, in such rows of numbers, or so many of it, one after the other; so many more axes come after its own."""
         repeated, shape = (1, self.shape) if count is None else (count, (count, *self.shape))
-        part = dots[..., self.start * repeated : (self.start + self.size) * repeated, :]
-        return part.reshape(*dots.shape[:-2], *shape, dots.shape[-1])
-
-    def of(self, numbers, count: int | None = None):
-        """The array, in such rows of numbers; or so many of it, one after the other."""
-        repeated, shape = (1, self.shape) if count is None else (count, (count, *self.shape))
-        part = numbers[..., self.start * repeated : (self.start + self.size) * repeated]
-        return part.reshape((*numbers.shape[:-1], *shape)).astype(self.dtype, copy=False)
+        axis = numbers.ndim - after - 1
+        part = numbers[(*[slice(None)] * axis, slice(self.start * repeated, (self.start + self.size) * repeated))]
+        found = part.reshape((*numbers.shape[:axis], *shape, *numbers.shape[axis + 1 :]))
+        return found.astype(self.dtype, copy=False)
 
 
 @dataclasses.dataclass(frozen=True)
 class KernelSource:
-    """A kernel's code, and what its arrays hold: values, then tangents of those that are real numbers."""
+    """A kernel's code, and what its arrays hold: values, then their tangents, None for what is no real number."""
 
     structures: tuple  # of the function's results
     source: str
     ends: tuple[Slot, ...]
     rows: tuple[Slot, ...]
-    end_dots: tuple[Slot, ...]
-    row_dots: tuple[Slot, ...]
+    end_dots: tuple[Slot | None, ...]
+    row_dots: tuple[Slot | None, ...]
 
     @functools.cached_property
     def widths(self) -> tuple[int, int, int, int]:
         """How many numbers each of these rows has, at least one."""
         ends, rows, end_dots, row_dots = (
-            max(sum(place.size for place in places), 1)
+            max(sum(place.size for place in places if place), 1)
             for places in (self.ends, self.rows, self.end_dots, self.row_dots)
         )
         return ends, rows, end_dots, row_dots
@@ -92,8 +84,7 @@ def traced_source(
         return tuple(tuple(jax.tree.leaves(part)) for part in found)
 
     def with_tangents(arrays, dots, instants):
-        found, moved = jvp_along(lambda arrays: values(arrays, instants), arrays, wide, dots)
-        return found, tuple(tuple(jax.tree.leaves(part)) for part in moved)
+        return jvp_along(lambda arrays: values(arrays, instants), arrays, wide, dots)
 
     moving = list(compress(like, wide))
     with own_settings():
@@ -105,13 +96,12 @@ def traced_source(
             end_dots, row_dots = (), ()
         # What is asked for: no more is written.
         jaxpr, _ = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars), instantiate=True)
-        lengths = np.cumsum([len(ends), len(rows), len(end_dots)])
+        lengths = np.cumsum([len(jax.tree.leaves(part)) for part in (ends, rows, end_dots)])
         of_kernel = _WriterOfKernel(jaxpr, shared, len(like), lengths, lanes)
         # Numbers that are known are computed now, whatever is being traced around this.
         with jax.ensure_compile_time_eval():
             source = of_kernel.source(traced.consts)
-    places = _places(ends), _places(rows, 1), _places(end_dots), _places(row_dots, 1)
-    return structures[-1], source, *map(tuple, places)
+    return structures[-1], source, _slots(ends), _slots(rows, 1), _slots(end_dots), _slots(row_dots, 1)
 
 
 def jvp_along(function: Callable, arrays: Sequence, wide: Sequence[bool], dots: Sequence) -> tuple:
@@ -146,23 +136,18 @@ def form_with_slopes(form: Form, wide: Sequence[bool]) -> Form:
 
 def source_from_plain(plain: tuple) -> KernelSource:
     """A `KernelSource` from its plain values."""
-    structures, source, *places = plain
-    structures = tuple(from_text(structure) for structure in structures)
-    return KernelSource(
-        structures,
-        source,
-        *(tuple(Slot(start, tuple(shape), dtype) for start, shape, dtype in those) for those in places),
-    )
+    structures, *rest = plain
+    return KernelSource(tuple(map(from_text, structures)), *rest)
 
 
-def _places(avals, leading: int = 0) -> list[tuple[int, tuple[int, ...], str]]:
-    """The parts of places in a row."""
+def _slots(avals, leading: int = 0) -> tuple[Slot | None, ...]:
+    """Where arrays are that lie one after the other; those of one row each, where rows are their leading axis."""
     found, start = [], 0
     for aval in avals:
-        shape = tuple(aval.shape)[leading:]
-        found.append((start, shape, np.dtype(aval.dtype).name))
-        start += count_of(shape)
-    return found
+        own = None if aval is None else Slot(start, tuple(aval.shape)[leading:], np.dtype(aval.dtype).name)
+        start += own.size if own else 0
+        found.append(own)
+    return tuple(found)
 
 
 class _WriterOfKernel:

@@ -138,17 +138,11 @@ class Kernel:
 
     def slopes(self, end_dots, row_dots, count: int):
         """The derivatives of real results from rows of directions: trees like those of the results, without the others."""
-        trees = []
-        of_dots = (
-            (end_dots, self.text.ends, self.text.end_dots, None),
-            (row_dots, self.text.rows, self.text.row_dots, count),
+        parts = (
+            [place and place.of(end_dots, after=1) for place in self.text.end_dots],
+            [place and place.of(row_dots, count, after=1) for place in self.text.row_dots],
         )
-        for structure, (dots, places, own, rows) in zip(self.text.structures, of_dots, strict=True):
-            real, leaves = iter(own), []
-            for place in places:
-                leaves.append(next(real).slopes(dots, rows) if place.is_real else None)
-            trees.append(jax.tree.unflatten(structure, leaves))
-        return tuple(trees)
+        return tuple(map(jax.tree.unflatten, self.text.structures, parts))
 
     def results(self, ends, rows):
         """The function's results from rows of numbers; these may have more axes before their own."""

@@ -69,15 +69,12 @@ def _tangents(kernel: Kernel, ends: int, rows: int, count: int, parts: list, mov
     )
 
 
-def _spread(size: int, dots, places: Sequence[Slot], dot_places: Sequence[Slot], repeated: int):
+def _spread(size: int, dots, places: Sequence[Slot], dot_places: Sequence[Slot | None], repeated: int):
     """Tangents of all numbers, from those of the real ones; each array is there so many times."""
-    real, parts = iter(dot_places), []
-    for place in places:
-        if place.is_real:
-            own = next(real)
-            parts.append(dots[own.start * repeated : (own.start + own.size) * repeated])
-        else:
-            parts.append(jnp.zeros(place.size * repeated))
+    parts = [
+        dots[own.start * repeated : (own.start + own.size) * repeated] if own else jnp.zeros(place.size * repeated)
+        for place, own in zip(places, dot_places, strict=True)
+    ]
     return jnp.concatenate(parts) if parts else jnp.zeros(size)
 
 
