@@ -22,11 +22,12 @@ import threading
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 
+from .argument_forms import ArrayForm, Form
 from .compiling import compiled, quick_compiler_options, transformed
 from .forking import refuse_if_forked
 from .kept_executables import NotSerializable, can_serialize, program_from, serialized
@@ -62,14 +63,16 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
             return otherwise(*args, **kwargs)
         leaves, structure = jax.tree.flatten((args, kwargs))
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        rest = tuple(_Array(leaf.shape, leaf.dtype.name) if eqx.is_array(leaf) else leaf for leaf in leaves)
+        # Unlike `Form.of`: by the arrays' own types, and numbers of Python's are no arrays.
+        told = (ArrayForm(leaf.shape, leaf.dtype.name) if eqx.is_array(leaf) else leaf for leaf in leaves)
+        form = Form(structure, tuple(told))
         # A compiled program belongs to one device.
-        key = folder, structure, rest, jax.config.jax_enable_x64, jax.config.jax_default_device
+        key = folder, form, jax.config.jax_enable_x64, jax.config.jax_default_device
         if key not in programs:
             # Threads that want the same program wait for the one that makes it.
             with lock:
                 if key not in programs:
-                    programs[key] = _program(function, structure, rest, arrays, quickly_compiled)
+                    programs[key] = _program(function, form, arrays, quickly_compiled)
         program = programs[key]
         if program is not None:
             try:
@@ -83,7 +86,7 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
 
 def kept_value(make: Callable[..., R], *args) -> R:
     """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs."""
-    path = _place(make, None, args)
+    path = _place(make, args)
     if path is None:
         return make(*args)
     found = _found(path, from_text)
@@ -92,13 +95,6 @@ def kept_value(make: Callable[..., R], *args) -> R:
         with contextlib.suppress(NotPlain):
             keep_code(path, to_text(found).encode())
     return found
-
-
-class _Array(NamedTuple):
-    """An argument that is an array."""
-
-    shape: tuple[int, ...]
-    dtype: str
 
 
 class _Foreign(Exception):
@@ -116,16 +112,16 @@ def _folder() -> str | None:
     return None if home is None else str(home / "fivjax" / FOLDER)
 
 
-def _program(function: Callable, structure, rest: tuple, arrays: Sequence, quickly_compiled: bool) -> Callable | None:
+def _program(function: Callable, form: Form, arrays: Sequence, quickly_compiled: bool) -> Callable | None:
     """A function of the arrays, read from the folder or made and written there; none where it cannot be named."""
-    path = _place(function, structure, rest)
+    path = _place(function, form)
     if path is None:
         return None
     options = quick_compiler_options() if quickly_compiled else {}
 
     def ready(content: bytes) -> Callable:
-        kind, form, program = content.split(b"\0", 2)
-        result = from_text(form)
+        kind, structure, program = content.split(b"\0", 2)
+        result = from_text(structure)
         if kind == EXECUTABLE:
             run = program_from(program)
             return lambda arrays: jax.tree.unflatten(result, run(arrays))
@@ -139,7 +135,7 @@ def _program(function: Callable, structure, rest: tuple, arrays: Sequence, quick
     if found is not None:
         return found
     try:
-        content, program = _made(function, structure, rest, arrays, options)
+        content, program = _made(function, form, arrays, options)
     except (NotPlain, NotImplementedError, ValueError):  # what `jax.export` refuses
         return None
     keep_code(path, content)
@@ -159,15 +155,15 @@ def keep_code(path: Path, content: bytes) -> None:
     make_room(path.parent, LARGEST)
 
 
-def _place(function: Callable, structure, rest: tuple) -> Path | None:
+def _place(function: Callable, given: tuple) -> Path | None:
     """The file for what a function makes of such arguments; none where these cannot be named, or nothing can be kept."""
-    named = _named(function, structure, rest) if _folder() else None
+    named = _named(function, given) if _folder() else None
     return None if named is None else place_of_code(named)
 
 
-def _named(function: Callable, structure, rest: tuple) -> str | None:
+def _named(function: Callable, given: tuple) -> str | None:
     try:
-        return f"{function.__name__}-{_digest(function, structure, rest)}"
+        return f"{function.__name__}-{_digest(function, given)}"
     except (_Foreign, pickle.PicklingError, AttributeError, TypeError):
         return None
 
@@ -184,18 +180,16 @@ def _found(path: Path, ready: Callable[[bytes], R]) -> R | None:
         return None
 
 
-def _made(function: Callable, structure, rest: tuple, arrays: Sequence, options) -> tuple[bytes, Callable | None]:
+def _made(function: Callable, form: Form, arrays: Sequence, options) -> tuple[bytes, Callable | None]:
     """A function compiled for such arrays: what is kept of it, and a function of the arrays. Where the compiled program cannot
     be kept, the traced one is, and is left to be compiled.
     """
-    forms = []
+    structures = []
 
     def of_arrays(*arrays):
-        own = iter(arrays)
-        leaves = [next(own) if isinstance(one, _Array) else one for one in rest]
-        args, kwargs = jax.tree.unflatten(structure, leaves)
+        args, kwargs = form.args(arrays)
         result = function(*args, **kwargs)
-        forms.append(jax.tree.structure(result))
+        structures.append(jax.tree.structure(result))
         return jax.tree.leaves(result)
 
     # By this name a profiler knows the program.
@@ -203,19 +197,19 @@ def _made(function: Callable, structure, rest: tuple, arrays: Sequence, options)
     like = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in arrays]
     if can_serialize():
         lowered = jax.jit(of_arrays, keep_unused=True, compiler_options=options).lower(*like)
-        form, compiled = structure_to_text(forms[-1]).encode(), lowered.compile()
-        result = forms[-1]
+        told, compiled = structure_to_text(structures[-1]).encode(), lowered.compile()
+        result = structures[-1]
         with contextlib.suppress(NotSerializable):
-            content = b"\0".join([EXECUTABLE, form, serialized(lowered, compiled)])
+            content = b"\0".join([EXECUTABLE, told, serialized(lowered, compiled)])
             return content, lambda arrays: jax.tree.unflatten(result, compiled(*arrays))
     from jax import export
 
     exported = export.export(jax.jit(of_arrays))(*like)
-    form = structure_to_text(forms[-1]).encode()
-    return b"\0".join([TRACED, form, exported.serialize()]), None
+    told = structure_to_text(structures[-1]).encode()
+    return b"\0".join([TRACED, told, exported.serialize()]), None
 
 
-def _digest(function: Callable, structure, rest: tuple) -> str:
+def _digest(function: Callable, given: tuple) -> str:
     device = jax.devices()[0]
     built_on = [
         *_versions(),
@@ -227,7 +221,7 @@ def _digest(function: Callable, structure, rest: tuple) -> str:
         str(jax.config.jax_enable_x64),
     ]
     name = f"{function.__module__}.{function.__qualname__}"
-    return hashlib.sha256(_pickled((_source(), built_on, name, structure, rest))).hexdigest()[:40]
+    return hashlib.sha256(_pickled((_source(), built_on, name, given))).hexdigest()[:40]
 
 
 @functools.cache
