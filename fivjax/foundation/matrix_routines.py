@@ -20,11 +20,13 @@ def register() -> None:
     jax.jit(jnp.linalg.eigvals).lower(np.eye(2))
 
 
+@jax.custom_jvp
 def eigenvalues(matrix: Num[Array, "n n"]) -> Complex[Array, " n"]:
     """The eigenvalues of a general matrix, in any order. Differentiable, more than once, where they are simple."""
-    return _eigenvalues(matrix)
+    return _one_at_a_time(jnp.linalg.eigvals)(matrix)
 
 
+@jax.custom_jvp
 def eigenvectors(
     matrix: Num[Array, "n n"],
 ) -> tuple[Complex[Array, " n"], Complex[Array, "n n"], Complex[Array, "n n"]]:
@@ -32,12 +34,13 @@ def eigenvectors(
 
     Differentiable where the eigenvalues are simple. Derivatives have no part along an eigenvector itself, whose length is free.
     """
-    return _eigenvectors(matrix)
+    return _one_at_a_time(lambda one: tuple(jax.lax.linalg.eig(one, compute_left_eigenvectors=True)))(matrix)
 
 
+@jax.custom_jvp
 def log_determinant(matrix: Float[Array, "n n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The sign of a determinant and the logarithm of its size. Differentiable where the matrix is regular."""
-    return _log_determinant(matrix)
+    return _one_at_a_time(lambda one: tuple(jnp.linalg.slogdet(one)))(matrix)
 
 
 def _one_at_a_time(function: Callable) -> Callable:
@@ -45,12 +48,7 @@ def _one_at_a_time(function: Callable) -> Callable:
     return jax.custom_batching.sequential_vmap(function) if jax.default_backend() == "cpu" else function
 
 
-@jax.custom_jvp
-def _eigenvalues(matrix):
-    return _one_at_a_time(jnp.linalg.eigvals)(matrix)
-
-
-@_eigenvalues.defjvp
+@eigenvalues.defjvp
 def _(primals, tangents):
     (matrix,), (change,) = primals, tangents
     values, left, right = eigenvectors(matrix)
@@ -60,15 +58,10 @@ def _(primals, tangents):
     return values, along
 
 
-@jax.custom_jvp
-def _eigenvectors(matrix):
-    return _one_at_a_time(lambda one: tuple(jax.lax.linalg.eig(one, compute_left_eigenvectors=True)))(matrix)
-
-
-@_eigenvectors.defjvp
+@eigenvectors.defjvp
 def _(primals, tangents):
     (matrix,), (change,) = primals, tangents
-    values, left, right = _eigenvectors(matrix)
+    values, left, right = eigenvectors(matrix)
     projected = left.conj().T @ change.astype(left.dtype) @ right
     lengths = jnp.sum(left.conj() * right, axis=0)
     gaps = jnp.where(jnp.eye(len(values), dtype=bool), jnp.inf, values[None, :] - values[:, None])
@@ -77,14 +70,9 @@ def _(primals, tangents):
     return (values, left, right), (jnp.diagonal(projected) / lengths, -left @ against.conj().T, right @ along)
 
 
-@jax.custom_jvp
-def _log_determinant(matrix):
-    return _one_at_a_time(lambda one: tuple(jnp.linalg.slogdet(one)))(matrix)
-
-
-@_log_determinant.defjvp
+@log_determinant.defjvp
 def _(primals, tangents):
     (matrix,), (change,) = primals, tangents
-    sign, size = _log_determinant(matrix)
+    sign, size = log_determinant(matrix)
     inverse = _one_at_a_time(jnp.linalg.inv)(matrix)
     return (sign, size), (jnp.zeros_like(sign), jnp.sum(inverse.T * change))
