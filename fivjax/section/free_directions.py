@@ -42,14 +42,6 @@ def jumped_to(y, weights: Float[np.ndarray, " state"], section: Float[np.ndarray
     return speed > rounding * ((weights * y) ** 2).sum(-1) ** 0.5
 
 
-def free_on_section(size: int, tangential: int, normal: int, status: int) -> Int[np.ndarray, " f"]:
-    """With one contact: indices in the state that are free, in a structure of `size` coordinates."""
-    held = [size + tangential]
-    if status != Status.DETACH:
-        held += [normal, size + normal]
-    return np.delete(np.arange(2 * size), held)
-
-
 def directions_of_several(
     weights: Float[np.ndarray, " state"],
     section: Float[np.ndarray, " n"],

@@ -28,7 +28,7 @@ from ..steppers.section import FADED
 from .about_sliding import longest_return, mechanics_about_sliding, weights_of
 from .by_kernel import SectionKernels, section_kernels
 from .crossings import Point, to_crossing
-from .free_directions import directions_of_several, free_on_section, jumped_to, section_row
+from .free_directions import directions_of_several, jumped_to, section_row, zero_on_section
 
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
@@ -182,20 +182,12 @@ class ReturnMaps:
         """With one contact: which coordinates are free at states of the section. An impact leaves the gap at zero, and its rate
         where it does not rebound, but any velocity, unless it ends the slip.
         """
-        free, jumped, n = self.free[status], self.jumped(y), self.structure.size
+        jumped, n = self.jumped(y), self.structure.size
+        free = ~zero_on_section(n, self.tangential, self.normal, status)
         free[jumped & ~self._without_slip(status, y), n + self.tangential] = True
         for place in (self.normal, n + self.normal):
             free[:, place] &= ~jumped | (y[:, place] != 0)
         return free
-
-    @cached_property
-    def free(self) -> Bool[np.ndarray, "modes 2n"]:
-        """With one contact: which coordinates of a state on the section each contact mode leaves free."""
-        size = len(self.weights)
-        found = np.zeros((len(Status), size), bool)
-        for status in Status:
-            found[status, free_on_section(size // 2, self.tangential, self.normal, status)] = True
-        return found
 
     def returns(self, group, at: Section, crossings, kept: int = 1, peaks: bool = False) -> Images:
         """The `crossings`-th crossing from each row, with the last `kept` states on the section, and with the largest speed if
