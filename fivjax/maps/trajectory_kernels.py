@@ -12,7 +12,7 @@ from ..foundation.complex_pairs import in_pairs
 from ..foundation.flattened import Flattened, flatten
 from ..kernels.functions import KernelFunction
 from ..kernels.kernel import Groups, kernel_of
-from ..section.by_kernel import in_parts, numbers_in_rows
+from ..section.by_kernel import in_parts
 from ..steppers.kernel_scope import goes_side_by_side
 from .groups import Task
 from .one_trajectory import Progress, TaskConstants, begin, conclude, with_step
@@ -47,7 +47,7 @@ class TrajectoryKernels:
         self.of_task, self.side_by_side = TaskConstants.of(task), goes_side_by_side(task.scene)
         of_groups = in_pairs(jax.tree.map(np.asarray, shared.tree))
         self.first = jax.tree.map(lambda leaf: leaf[0], of_groups)
-        self.table = numbers_in_rows(of_groups)
+        self.table = flatten(of_groups).numbers
         self.shared, self.pool = len(jax.tree.leaves(self.first)), pool
         self.forms: dict[KernelFunction, Form] = {}
 
@@ -70,7 +70,7 @@ class TrajectoryKernels:
         kick, now = trajectories.tree
         given = kick, now, np.full(len(group), steps, np.int32)
         after = self._of_each(_follow, group, given, on_gpus=True, side_by_side=self.side_by_side)
-        trajectories.numbers[:, kick.shape[-1] :] = numbers_in_rows(after)
+        trajectories.numbers[:, kick.shape[-1] :] = flatten(after).numbers
 
     def conclude(
         self, group: Int[np.ndarray, " m"], trajectories: Flattened, rows: Int[np.ndarray, " r"], began
@@ -103,7 +103,7 @@ class TrajectoryKernels:
         """The results of a kernel for each trajectory, of its group's data and its own. What takes few steps is over on a CPU
         before another kernel is compiled.
         """
-        form, given, parts = self._form(function, own), numbers_in_rows(own), []
+        form, given, parts = self._form(function, own), flatten(jax.tree.map(np.asarray, own)).numbers, []
         for rows in in_parts(len(group), 8 * given.shape[1]):
             groups = Groups.of(self.table, group[rows])
             run = function.of_groups(form, self.shared, groups, given[rows], self.pool, on_gpus, side_by_side)

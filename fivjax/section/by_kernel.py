@@ -4,17 +4,18 @@ from concurrent.futures import Executor
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from ..contact import Contact
 from ..foundation.argument_forms import Form
+from ..foundation.flattened import flatten
 from ..kernels.kernel import kernel_of
 from ..model.scene import Scene
 from ..steppers.event_exact import EXACT_STEPPER
 from ..steppers.kernel_scope import goes_side_by_side, has_kernel
 from .crossings import Arrival, Point, motion_to_section
 
-# Rows of numbers for a kernel are put together for so many bytes at a time.
+# A kernel is launched for rows that take so many bytes at a time: GPUs have to hold no more at once.
 AT_A_TIME = 2**26
 
 
@@ -23,7 +24,7 @@ class SectionKernels:
 
     def __init__(self, whose, pool: Executor | None, side_by_side: bool = False):
         self.pool, self.side_by_side = pool, side_by_side
-        self.table = numbers_in_rows(whose)
+        self.table = flatten(jax.tree.map(np.asarray, whose)).numbers
         first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], whose)
         mechanics, _ = first
         of_contacts = np.zeros(np.shape(mechanics.belt_speed))
@@ -102,12 +103,6 @@ def _on_section(end: Arrival):
     """State, status and direction on the section; the state is NaN where the section was not reached."""
     point, contact = end.at.point, end.at.point.contact
     return np.where(end.arrived[:, None], point.y, np.nan), contact.status.astype(np.int32), contact.direction
-
-
-def numbers_in_rows(tree) -> Float[np.ndarray, "g k"]:
-    """All numbers of a tree whose arrays have a leading axis, in a row for each of its entries."""
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-    return np.concatenate([leaf.reshape(len(leaf), -1).astype(float) for leaf in leaves], axis=1)
 
 
 def in_parts(count: int, each: int) -> list[slice]:
