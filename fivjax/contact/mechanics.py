@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from ..foundation.linear_solve import solve
 from ..model.friction import AbstractFriction
 from ..model.friction_per_contact import FrictionPerContact
-from ..model.scene import Scene, steady_slip_speeds
+from ..model.scene import Scene, refuse_vector_contacts, steady_slip_speeds
 from ..model.springs import Springs
 from ..model.structure import Structure
 
@@ -54,7 +54,8 @@ class Mechanics(eqx.Module):
     def __init__(self, scene: Scene):
         structure, matrices = scene.structure, scene.structure.matrices
         n = structure.size
-        self.places = _places(structure)
+        refuse_vector_contacts(structure, "This")
+        self.places = structure.places
         columns = jnp.eye(n, dtype=matrices.mass.dtype)[
             :, np.array(self.places).T.ravel()
         ]  # tangential directions, then normal ones
@@ -142,15 +143,3 @@ class Mechanics(eqx.Module):
         """
         _, g_tn, g_nn = self.compliance
         return g_nn + direction * mu * g_tn
-
-
-def _places(structure: Structure) -> tuple[tuple[int, int], ...]:
-    found = []
-    for tangential, normal in structure.places:
-        if not isinstance(tangential, int) or not isinstance(normal, int):
-            raise ValueError(
-                "This needs contacts whose directions are coordinates, but some of them are vectors. Give the structure as "
-                "`fivjax.in_contact_coordinates(structure)`."
-            )
-        found.append((tangential, normal))
-    return tuple(found)
