@@ -82,13 +82,11 @@ def blocks(path: Path, kind: str, data, indices, starts, shape: tuple[int, int])
         raise unreadable(path, kind, f"blocks of {high} rows and {wide} columns do not fill shape {shape}")
     check_rows(path, kind, max(shape), data.size)
     # Where each block goes, from a matrix of the blocks' numbers.
-    numbers, outer = np.arange(1, len(data) + 1), (shape[0] // high, shape[1] // wide)
-    where = compressed(path, kind, "csr", numbers, indices, starts, outer).tocoo()
-    rows = (where.row * high)[:, None, None] + np.arange(high)[:, None]
-    columns = (where.col * wide)[:, None, None] + np.arange(wide)
-    values = np.take(data, np.asarray(where.data, int) - 1, axis=0)
-    rows, columns = np.broadcast_to(rows, values.shape), np.broadcast_to(columns, values.shape)
-    return sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
+    outer = shape[0] // high, shape[1] // wide
+    where = compressed(path, kind, "csr", np.arange(len(data)), indices, starts, outer)
+    found = sparse.bsr_array((data[: where.nnz], where.indices, where.indptr), shape=shape).tocsr()
+    found.sum_duplicates()
+    return found
 
 
 def shape_of(path: Path, kind: str, shape) -> tuple[int, int]:
