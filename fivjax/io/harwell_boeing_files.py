@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from .file_matrix import FileMatrix, fortran_number, text_of
-from .reading_limits import check_rows
+from .sparse_parts import compressed
 
 # How much of a file tells whether it is one; digits of the longest number in its header.
 HEAD, LONGEST = 400, 12
@@ -45,7 +45,7 @@ def matrix(path: Path) -> dict[str, FileMatrix | str]:
     header = _header(place, lines)
     if header.kind[0] == "C":
         return {path.stem: f"{place} holds a complex matrix. Write the real stiffness, mass or damping."}
-    rows, columns = header.shape
+    columns = header.shape[1]
     ends = np.cumsum([header.length, *header.lines])
     if ends[-1] > len(lines):
         raise ValueError(f"{place} must have {ends[-1]} lines by its header, but has {len(lines)}. Write it again.")
@@ -54,15 +54,12 @@ def matrix(path: Path) -> dict[str, FileMatrix | str]:
         _numbers(f"{place}, lines {a + 1} to {b}", lines[a:b], header.formats[part], kind, wanted[part])
         for part, (a, b, kind) in enumerate(zip(ends[:3], ends[1:], (int, int, float), strict=False))
     )
-    check_rows(path, "Harwell-Boeing", max(header.shape), header.entries)
     starts = positions - 1
     if starts[0] != 0 or starts[-1] != header.entries or np.any(np.diff(starts) < 0):
         raise ValueError(
             f"{place}: the positions of its columns must go from 1 up to {header.entries + 1}. Write it again."
         )
-    if np.any((places < 1) | (places > rows)):
-        wrong = places[(places < 1) | (places > rows)][0]
-        raise ValueError(f"{place} has an entry in row {wrong} of {rows}. Write it again.")
+    found = compressed(path, "Harwell-Boeing", "csc", values, places - 1, starts, header.shape).tocoo()
     column = np.repeat(np.arange(columns), np.diff(starts))
     order = np.lexsort((places, column))
     double = order[1:][(np.diff(places[order]) == 0) & (np.diff(column[order]) == 0)]
@@ -70,7 +67,6 @@ def matrix(path: Path) -> dict[str, FileMatrix | str]:
         raise ValueError(
             f"{place} gives row {places[double[0]]} of column {column[double[0]] + 1} twice. Write each entry once."
         )
-    found = sparse.csc_array((values, places - 1, starts), shape=header.shape).tocoo()
     i, j, data = found.row, found.col, found.data
     if header.kind[1] == "S":
         if np.any(i < j) and np.any(i > j):

@@ -457,7 +457,7 @@ DAMAGED = {
     "a Harwell-Boeing row that is not there": (
         "a.hb",
         HARWELL_BOEING.replace("   1   3   2", "   1   9   2"),
-        r"in row 9 of 4",
+        r"entry 2 of a sparse matrix is in row 9, but the matrix has 4",
     ),
     "a Harwell-Boeing row twice": (
         "a.hb",
