@@ -13,7 +13,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-from scipy import sparse
 
 from . import sparse_parts
 from .file_matrix import FileMatrix, Label, from_entries, integer, real, text_of
@@ -133,19 +132,7 @@ def _label(here: str, node: str, direction: str) -> Label:
 
 
 def output4(path: Path) -> dict[str, FileMatrix]:
-    """The matrices of an OUTPUT4 file, by name; it does not say which node and direction a row belongs to."""
-    loaded = output4_matrices(path)
-    found = {
-        name.upper(): FileMatrix(sparse.csr_array(matrix), None, f"File `{path}`, matrix `{name.upper()}`")
-        for name, matrix in loaded.items()
-    }
-    if not found:
-        raise ValueError(f"File `{path}` holds no matrix. Write it again.")
-    return found
-
-
-def output4_matrices(path: Path) -> dict:
-    """The matrices of a file by name, sparse, of whatever shape.
+    """The matrices of an OUTPUT4 file, by name; it does not say which node and direction a row belongs to.
 
     **Raises:** `ImportError` without pyyeti, `ValueError` for a file that is damaged.
     """
@@ -154,16 +141,17 @@ def output4_matrices(path: Path) -> dict:
             f'File `{path}` needs pyyeti to be read. Install it with `pip install "fivjax[fe]"`, or give the '
             f"matrices as DMIG in a `.pch` file."
         )
-    shapes, parts = {}, {}
+    shapes, parts, found = {}, {}, {}
     kind = "OUTPUT4"
     for about, values in parts_of(path, "output4", kind):
         if values is None:
             shapes[about["name"]] = tuple(about["shape"])
         else:
             parts[about["name"]] = values
-    return {
-        name: sparse_parts.triplets(
-            path, kind, parts[f"{name}/data"], parts[f"{name}/row"], parts[f"{name}/col"], shape
-        )
-        for name, shape in shapes.items()
-    }
+    for name, shape in shapes.items():
+        data, rows, columns = (parts[f"{name}/{part}"] for part in ("data", "row", "col"))
+        matrix = sparse_parts.triplets(path, kind, data, rows, columns, shape)
+        found[name.upper()] = FileMatrix(matrix, None, f"File `{path}`, matrix `{name.upper()}`")
+    if not found:
+        raise ValueError(f"File `{path}` holds no matrix. Write it again.")
+    return found
