@@ -42,6 +42,10 @@ from .stretches import MODES
 if TYPE_CHECKING:
     import xarray as xr
 
+# What a trajectory has in each row for all coordinates, and for each contact.
+OF_COORDINATES = ("displacement", "velocity", "acceleration")
+OF_CONTACTS = ("status", "normal_force", "friction_force")
+
 
 class Trajectory(eqx.Module):
     """A response in time. Rows are saved instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size.
@@ -118,7 +122,7 @@ class Trajectory(eqx.Module):
         **Raises:** `ValueError` for a dataset without a scene in its attributes, or one that is not a whole trajectory.
         """
         scene = Scene.from_dataset(dataset)
-        rows = ("t", "displacement", "velocity", "acceleration", "status", "normal_force", "friction_force", "load")
+        rows = ("t", *OF_COORDINATES, *OF_CONTACTS, "load")
         try:
             settings = tuple(json.loads(dataset.attrs.get("settings", "{}")).items())
             outcome = np.int8(Ending[dataset.attrs["outcome"].upper()])
@@ -130,7 +134,7 @@ class Trajectory(eqx.Module):
             ) from None
         count, size = len(values["t"]), len(scene.structure.coordinates)
         for name, value in values.items():
-            wide = name in ("displacement", "velocity", "acceleration")
+            wide = name in OF_COORDINATES
             if value.dtype.kind not in "biuf" or value.shape[:1] != (count,) or (wide and value.shape != (count, size)):
                 raise ValueError(
                     f"Argument `dataset` must be a saved trajectory of {count} instants and {size} coordinates, but `{name}` "
@@ -145,16 +149,9 @@ class Trajectory(eqx.Module):
         self.refuse_batch("A dataset")
         along = ("t", "coordinate")
         each = ("t",) if np.ndim(self.status) == 1 else ("t", "contact")
+        axes = {**dict.fromkeys(OF_COORDINATES, along), **dict.fromkeys(OF_CONTACTS, each), "load": "t"}
         dataset = xr.Dataset(
-            {
-                "displacement": (along, np.asarray(self.displacement)),
-                "velocity": (along, np.asarray(self.velocity)),
-                "acceleration": (along, np.asarray(self.acceleration)),
-                "status": (each, np.asarray(self.status)),
-                "normal_force": (each, np.asarray(self.normal_force)),
-                "friction_force": (each, np.asarray(self.friction_force)),
-                "load": ("t", np.asarray(self.load)),
-            },
+            {name: (own, np.asarray(getattr(self, name))) for name, own in axes.items()},
             coords={"t": np.asarray(self.t), "coordinate": list(self.scene.structure.coordinates)},
         )
         if self.energy is not None:
