@@ -74,7 +74,11 @@ def _available() -> int | None:
             table = dict(line.split(":", 1) for line in file)
         return int(table["MemAvailable"].split()[0]) * 1024
     except (OSError, ValueError, KeyError):
-        pass
+        return machine_memory()
+
+
+def machine_memory() -> int | None:
+    """The memory of this machine, in bytes; None where the system does not say."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):  # Windows

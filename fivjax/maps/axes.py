@@ -1,13 +1,13 @@
 """Axes and arguments of maps and critical kicks, checked; and the critical friction that their datasets note."""
 
 import math
-import os
 from collections.abc import Mapping
 
 import numpy as np
 
 from ..foundation import arguments
 from ..io.datasets import check_axis_names
+from ..io.reading_limits import machine_memory
 from ..linear.critical import critical_friction
 from ..model.scene import Scene, check_corners
 from ..steppers.base import AbstractStepper
@@ -63,7 +63,7 @@ def check_size(axes: Mapping, halvings: int = 0, energy: bool = False, sparse: b
     if sparse:
         counts = {name: _count(values) for name, values in axes.items()}
     total, each = math.prod(counts.values()), sum(part.nbytes for part in by_name(not_run(1, energy)).values())
-    if total <= most_trajectories and total * each <= _memory():
+    if total <= most_trajectories and total * each <= (machine_memory() or math.inf):
         return
     listed = " × ".join(f"{count:,} of `{name}`" for name, count in counts.items())
     raise ValueError(
@@ -78,14 +78,6 @@ def _count(values) -> int:
         return max(len(values), 1)  # none are refused later
     except TypeError:  # one number
         return 1
-
-
-def _memory() -> float:
-    """The memory of this machine, in bytes."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # Windows
-        return math.inf
 
 
 def check_run(scene: Scene, method: AbstractStepper, t_max: float | None, memory: float) -> None:
