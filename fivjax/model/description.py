@@ -17,7 +17,7 @@ from ..foundation.quantities import QUANTITIES
 from ..foundation.traced_code import digest
 from .belt import belt_oscillator
 from .contact_point import ContactPoint
-from .friction import AbstractFriction
+from .friction import AbstractFriction, rebuilt
 from .friction_per_contact import FrictionPerContact
 from .load import AbstractLoad
 from .own_structures import remembered
@@ -73,7 +73,7 @@ def code_of_structure(structure: Structure) -> str:
 
 
 def _of_law(law: AbstractFriction, speed):
-    law = _rebuild(law)
+    law = rebuilt(law, {})  # as `Scene.replace` makes it for other values
     own_series = type(law).in_time is not AbstractFriction.in_time
     series = law.in_time(speed, 2)([speed, speed, speed], [speed, speed]) if own_series else None
     # With the derivative: a law may define its own.
@@ -81,18 +81,13 @@ def _of_law(law: AbstractFriction, speed):
 
 
 def _of_load(load: AbstractLoad, t):
-    load = _rebuild(load)
+    load = rebuilt(load, {})
     return load.force, load.final, load.jumps, load(t)
 
 
 def _of_structure(structure: Structure, parameters: Mapping):
     made = structure.replace(**parameters)
     return made, made.matrices, made.damping_parts
-
-
-def _rebuild(part):
-    """A law or a load as `Scene.replace` makes it for other values."""
-    return type(part)(**{name: value for name, value in vars(part).items() if value is not None})
 
 
 def _laws(friction: AbstractFriction) -> str | list[str]:

@@ -5,7 +5,7 @@ worked out in `contact`.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -188,6 +188,12 @@ def numeric_fields(part: eqx.Module) -> dict[str, Array]:
         if name not in fixed
     }
     return {name: value for name, value in known.items() if eqx.is_inexact_array(value)}
+
+
+def rebuilt(part, changes: Mapping):
+    """A law or a load with other values of some fields, made by its constructor, to which those without a value are left."""
+    own = {name: value for name, value in vars(part).items() if value is not None}
+    return type(part)(**{name: changes.get(name, value) for name, value in own.items()})
 
 
 def slope_of(law: AbstractFriction, slip_speed: Float[Array, "*contacts"]) -> Float[Array, "*contacts"]:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
-from .friction import AbstractFriction, NextTerm, numeric_fields
+from .friction import AbstractFriction, NextTerm, numeric_fields, rebuilt
 
 
 class FrictionPerContact(AbstractFriction):
@@ -44,9 +44,8 @@ class FrictionPerContact(AbstractFriction):
         """With other values of some of the parameters."""
         laws = []
         for i, law in enumerate(self.laws):
-            own = {name: value for name, value in vars(law).items() if value is not None}
-            changed = {name: changes[f"{name}_{i}"] for name in own if f"{name}_{i}" in changes}
-            laws.append(type(law)(**{**own, **changed}) if changed else law)
+            changed = {name: changes[f"{name}_{i}"] for name in vars(law) if f"{name}_{i}" in changes}
+            laws.append(rebuilt(law, changed) if changed else law)
         return FrictionPerContact(laws)
 
     @property

@@ -26,7 +26,7 @@ from ..foundation.precision import (
 from . import description
 from .contact_coordinates import in_contact_coordinates, transformation
 from .delassus_matrix import delassus, has_one_solution
-from .friction import AbstractFriction, numeric_fields
+from .friction import AbstractFriction, numeric_fields, rebuilt
 from .friction_per_contact import FrictionPerContact
 from .load import AbstractLoad, ConstantLoad
 from .printing import as_call
@@ -153,10 +153,7 @@ class Scene(eqx.Module):
         def rebuild(part):
             if isinstance(part, FrictionPerContact):
                 return part.replace(**changes)
-            own = {name: value for name, value in vars(part).items() if value is not None}
-            if not own.keys() & changes.keys():
-                return part
-            return type(part)(**{name: changes.get(name, value) for name, value in own.items()})
+            return rebuilt(part, changes) if numeric_fields(part).keys() & changes.keys() else part
 
         of_structure = {name: changes[name] for name in self.structure.parameters if name in changes}
         return Scene(
