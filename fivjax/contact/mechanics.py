@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from ..foundation.linear_solve import solve
 from ..model.friction import AbstractFriction
 from ..model.friction_per_contact import FrictionPerContact
-from ..model.scene import Scene, refuse_vector_contacts, steady_slip_speeds
+from ..model.scene import Scene, refuse_vector_contacts, sliding_friction
 from ..model.springs import Springs
 from ..model.structure import Structure
 
@@ -24,7 +24,7 @@ class Rest(eqx.Module):
     def __init__(self, scene: Scene, load: Float[Array, ""], normal_force: Float[Array, "*contacts"]):
         """The rest of a scene whose contacts press with `normal_force` (N) under `load` (N), from `steady_sliding`."""
         self.load = load
-        self.friction = jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
+        self.friction = sliding_friction(scene)
         self.tangential_force = self.friction * normal_force
         self.normal_force = normal_force
 

@@ -10,7 +10,7 @@ from ..foundation.kept_programs import kept
 from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, real
 from ..io.datasets import check_axis_names, labelled
-from ..model.scene import Scene
+from ..model.scene import Scene, sliding_friction
 from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_rows
 from ..model.structure import Structure
 from .linearisation import slope_damping, tangential_corner, time_scale
@@ -90,8 +90,7 @@ def _chart(scene, names, columns):
     def polynomial(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))
         normal_force = _normal_force(point)
-        friction = jnp.sign(point.belt_speed) * point.friction(jnp.abs(point.belt_speed))
-        mass, damping, stiffness = sliding_matrices(point.structure, friction)
+        mass, damping, stiffness = sliding_matrices(point.structure, sliding_friction(point))
         damping = damping + slope_damping(point, normal_force) * tangential_corner(point.structure)
         scale = time_scale(point.structure)
         coefficients = characteristic_polynomial(mass, damping, stiffness, scale)
@@ -129,12 +128,10 @@ def _is_expanded(structure: Structure) -> bool:
 def _normal_force(scene: Scene):
     """That of steady sliding in N, by sums and products only, for few coordinates."""
     structure = scene.structure
-    speed = jnp.abs(scene.belt_speed)
     n, keep = structure.normal, sliding_coordinates(structure.size, structure.normal)
-    friction = jnp.sign(scene.belt_speed) * scene.friction(speed)
     # The sliding rows of [K, f], bordered by the normal row: by Cramer's rule N/F = -det[[K, f], [k_n, f_n]] / det K.
     table = jnp.concatenate([structure.stiffness, structure.load_direction[:, None]], axis=1)
-    rows = sliding_rows(structure, table, friction)
+    rows = sliding_rows(structure, table, sliding_friction(scene))
     columns = [*keep, structure.size]
     stiffness = determinant([[[row[j]] for j in keep] for row in rows])[0][0]
     bordered = determinant([[[row[j]] for j in columns] for row in [*rows, table[n]]])[0][0]

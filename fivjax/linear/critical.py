@@ -13,7 +13,7 @@ from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
-from ..model.scene import Scene, refuse_several_contacts, steady_sliding
+from ..model.scene import Scene, refuse_several_contacts, steady_sliding, steady_slip_speeds
 from ..model.sliding import contact_coordinates, free_in_sliding
 from ..model.structure import Structure
 from .crossings import first_limit
@@ -219,8 +219,7 @@ def friction_slope(scene: Scene) -> Float[Array, ""]:
 
 @by_numpy
 def _slopes_of_friction(scene):
-    contacts, speed = len(scene.structure.contacts), jnp.abs(scene.belt_speed)
-    return slope_of(scene.friction, speed if contacts == 1 else jnp.broadcast_to(speed, (contacts,)))
+    return slope_of(scene.friction, steady_slip_speeds(scene))
 
 
 def _a_scene(scene):

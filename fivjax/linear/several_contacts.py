@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from ..foundation.matrix_routines import eigenvalues
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
-from ..model.scene import Scene, steady_sliding
+from ..model.scene import Scene, sliding_friction, steady_sliding
 from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices
 from ..model.structure import Structure
 from .gradients import in_natural_units, significant_growth
@@ -41,7 +41,7 @@ def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"
     if one_contact(scene.structure):
         return linear_sliding(scene).matrix, forces
     speed = jnp.broadcast_to(jnp.abs(scene.belt_speed), forces.shape)
-    friction = jnp.broadcast_to(jnp.sign(scene.belt_speed) * scene.friction(speed), forces.shape)
+    friction = jnp.broadcast_to(sliding_friction(scene), forces.shape)
     slopes = jnp.zeros_like(friction) if scene.friction.constant else forces * slope_of(scene.friction, speed)
     return sliding_state_matrix(scene.structure, friction, slopes), forces
 

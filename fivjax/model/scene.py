@@ -286,7 +286,7 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
         z, normal_force = steady_sliding(scene_in_contact_coordinates(scene), force)
         return jnp.asarray(transformation(scene.structure)[0]) @ z, normal_force
     structure = scene.structure
-    friction = jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
+    friction = sliding_friction(scene)
     _, _, stiffness = sliding_matrices(structure, friction)
     load = sliding_load(structure, friction)
     reduced = solve(stiffness, load * force)
@@ -308,6 +308,11 @@ def steady_slip_speeds(scene: Scene) -> Float[Array, "*contacts"]:
     """The slip speed of steady sliding, in m/s; one for each of several contacts."""
     speed, count = jnp.abs(scene.belt_speed), len(scene.structure.contacts)
     return speed if count == 1 else jnp.broadcast_to(speed, count)
+
+
+def sliding_friction(scene: Scene) -> Float[Array, "*contacts"]:
+    """σμ of steady sliding: the coefficient with the sign of the belt's direction; one for each of several contacts."""
+    return jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
 
 
 @by_numpy
