@@ -11,12 +11,11 @@ from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, real
 from ..io.datasets import check_axis_names, labelled
 from ..model.scene import Scene, sliding_friction
-from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_rows
+from ..model.sliding import sliding_coordinates, sliding_rows
 from ..model.structure import Structure
-from .linearisation import slope_damping, tangential_corner, time_scale
+from .linearisation import sliding_motion, steady_matrices, time_scale
 from .polynomials import characteristic_polynomial, determinant, polynomial_roots
 from .routh_hurwitz import LARGEST_EXPANDED, hurwitz_determinants
-from .several_contacts import one_contact, sliding_motion
 from .system import with_axes
 
 if TYPE_CHECKING:
@@ -90,8 +89,7 @@ def _chart(scene, names, columns):
     def polynomial(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))
         normal_force = _normal_force(point)
-        mass, damping, stiffness = sliding_matrices(point.structure, sliding_friction(point))
-        damping = damping + slope_damping(point, normal_force) * tangential_corner(point.structure)
+        mass, damping, stiffness = steady_matrices(point, normal_force)
         scale = time_scale(point.structure)
         coefficients = characteristic_polynomial(mass, damping, stiffness, scale)
         ok = _slides(point, normal_force) & (mass[0, 0] > 0)
@@ -122,7 +120,7 @@ def _chart(scene, names, columns):
 
 def _is_expanded(structure: Structure) -> bool:
     """Whether the characteristic polynomial is written out."""
-    return one_contact(structure) and structure.size - 1 <= LARGEST_EXPANDED
+    return len(structure.contacts) == 1 and structure.size - 1 <= LARGEST_EXPANDED
 
 
 def _normal_force(scene: Scene):

@@ -20,7 +20,7 @@ from .crossings import first_limit
 from .feedback import friction_loop, slope_loop
 from .gradients import by_numpy_if_small, with_own_gradient
 from .outcomes import CODES, WHY, Mechanism, StabilityOutcome
-from .several_contacts import critical_friction_of_several, first_limit_of_several, one_contact
+from .several_contacts import critical_friction_of_several, first_limit_of_several
 from .system import as_scene, check_direction
 
 
@@ -87,7 +87,7 @@ def _checked(structure: Structure, direction) -> Structure:
 
 def _along(own: Structure, direction) -> Float[np.ndarray, "*c"]:
     """The belt's direction, at each contact where there are several: one program serves contacts of any directions."""
-    return np.full(() if one_contact(own) else len(own.contacts), float(direction))
+    return np.full(() if len(own.contacts) == 1 else len(own.contacts), float(direction))
 
 
 def _is_a_limit(value):
@@ -135,7 +135,7 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     """
     own = _checked(structure, direction)
     given = matrices_only(own) if all(map(is_known, jax.tree.leaves(structure))) else structure
-    limit = _friction_limit if one_contact(own) else _friction_limit_of_several
+    limit = _friction_limit if len(own.contacts) == 1 else _friction_limit_of_several
     return limit(given, _along(own, direction))
 
 
@@ -168,7 +168,7 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
         (67.92, 'flutter')
     """
     own = _checked(structure, direction)
-    limit = _stability_limit if one_contact(own) else _stability_limit_of_several
+    limit = _stability_limit if len(own.contacts) == 1 else _stability_limit_of_several
     return limit(matrices_only(own), _along(own, direction))
 
 

@@ -11,8 +11,14 @@ from ..contact import Contact, Mechanics, ModeForces
 from ..foundation.linear_solve import solve
 from ..foundation.numpy_evaluation import by_numpy
 from ..model.friction import slope_of
-from ..model.scene import Scene, steady_sliding
-from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_states
+from ..model.scene import Scene, scene_in_contact_coordinates, sliding_friction, steady_sliding, steady_slip_speeds
+from ..model.sliding import (
+    contact_coordinates,
+    free_in_sliding,
+    sliding_coordinates,
+    sliding_matrices,
+    sliding_states,
+)
 from ..model.structure import Structure
 
 # The proof for friction that depends on slip speed holds for slip speeds above this share of the belt speed.
@@ -58,8 +64,6 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     direction = jnp.sign(scene.belt_speed)
     keep = sliding_states(n, mechanics.normal)
     friction = direction * mechanics.friction(jnp.abs(scene.belt_speed))
-    mass, damping, stiffness = sliding_matrices(scene.structure, friction)
-    damping = damping + slope_damping(scene, normal_force) * tangential_corner(scene.structure)
 
     def pressing(z):
         return -physics.free_acceleration(mechanics, load, equilibrium.at[keep].add(z))[mechanics.normal]
@@ -82,7 +86,7 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     compliance = jnp.where(compliance > 0, compliance, 0.0)  # and then there is no bound
     return LinearSliding(
         equilibrium=equilibrium,
-        matrix=state_matrix(mass, damping, stiffness),
+        matrix=state_matrix(*steady_matrices(scene, normal_force)),
         # The motion without friction, which takes no energy from the belt.
         frictionless=state_matrix(*sliding_matrices(scene.structure, jnp.zeros_like(friction))),
         pressing=jax.grad(pressing)(rest),
@@ -116,12 +120,6 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     keep = sliding_states(n, mechanics.normal)
     mu = law(speed)
     dragging = direction * mu
-    mass, damping, stiffness = sliding_matrices(scene.structure, dragging)
-    if not law.constant:
-        slopes = slope_of(law, speed)
-        free = sliding_coordinates(n, mechanics.normal)
-        along = jnp.asarray(free[:, None] == mechanics.tangential, damping.dtype)
-        damping = damping + (along * (normal_force * slopes)) @ along.T
     mode = ModeForces(mechanics, Contact.sliding(direction), mu)
 
     def pressing(z):
@@ -144,7 +142,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     each = forces + changes @ (forces + LOWEST_SLIP * added)
     return LinearSliding(
         equilibrium=equilibrium,
-        matrix=state_matrix(mass, damping, stiffness),
+        matrix=state_matrix(*steady_matrices(scene, normal_force)),
         frictionless=state_matrix(*sliding_matrices(scene.structure, jnp.zeros_like(dragging))),
         pressing=jax.jacfwd(pressing)(rest),
         pressing_margin=pressing(rest),
@@ -162,7 +160,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
 
 def sliding_rates(scene: Scene) -> Complex[np.ndarray, " m"]:
     """Eigenvalues of steady sliding, in 1/s, the fastest growing first; NaN where it has no finite state matrix."""
-    matrix = np.asarray(_sliding_matrix(scene))
+    matrix = np.asarray(sliding_matrix(scene))
     if not np.all(np.isfinite(matrix)):
         return np.full(len(matrix), np.nan, complex)
     values = np.linalg.eigvals(matrix).astype(complex)
@@ -170,8 +168,18 @@ def sliding_rates(scene: Scene) -> Complex[np.ndarray, " m"]:
 
 
 @by_numpy
-def _sliding_matrix(scene: Scene):
-    return linear_sliding(scene).matrix
+def sliding_matrix(scene: Scene) -> Float[Array, "m m"]:
+    """The state matrix of a scene's steady sliding."""
+    return sliding_motion(scene)[0]
+
+
+def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"]]:
+    """The state matrix of a scene's steady sliding in contact coordinates, and its normal forces in N; not finite where there
+    is none.
+    """
+    scene = scene_in_contact_coordinates(scene)
+    _, normal_force = steady_sliding(scene, scene.load.final)
+    return state_matrix(*steady_matrices(scene, normal_force)), jnp.atleast_1d(normal_force)
 
 
 def state_matrix(
@@ -183,19 +191,21 @@ def state_matrix(
     return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=mass.dtype), lower])
 
 
-def slope_damping(scene: Scene, normal_force: Float[Array, ""]) -> Float[Array, ""]:
-    """The damping along the belt by friction that varies with slip speed, N dμ/dv in N·s/m: negative where friction falls."""
-    speed = jnp.abs(scene.belt_speed)
-    if scene.friction.constant:
-        # With constant friction the sliding motion is linear and the same about any state.
-        return jnp.zeros_like(speed)
-    return normal_force * slope_of(scene.friction, speed)
-
-
-def tangential_corner(structure: Structure) -> np.ndarray:
-    """One on the tangential diagonal of a matrix of the sliding motion, zero elsewhere."""
-    along = sliding_coordinates(structure.size, structure.normal) == structure.tangential
-    return np.outer(along, along).astype(np.float64)
+def steady_matrices(
+    scene: Scene, normal_force: Float[Array, "*contacts"]
+) -> tuple[Float[Array, "k k"], Float[Array, "k k"], Float[Array, "k k"]]:
+    """M, C and K of small motions about steady sliding, with the damping along the belt by friction that varies with slip
+    speed, N dμ/dv in N·s/m: negative where friction falls.
+    """
+    structure = scene.structure
+    mass, damping, stiffness = sliding_matrices(structure, sliding_friction(scene))
+    # With constant friction the sliding motion is linear and the same about any state.
+    if not scene.friction.constant:
+        slopes = normal_force * slope_of(scene.friction, steady_slip_speeds(scene))
+        along = free_in_sliding(structure)[:, None] == np.atleast_1d(contact_coordinates(structure)[0])
+        # A product with a constant rather than an update in place: in a batch it stays elementwise.
+        damping = damping + np.eye(len(along)) * jnp.sum(along * slopes, axis=1)
+    return mass, damping, stiffness
 
 
 def time_scale(structure: Structure) -> Float[Array, ""]:

@@ -7,12 +7,13 @@ import numpy as np
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import following, stage, tick
 from ..io.datasets import check_axis_names, labelled
+from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import Scene
+from ..model.sliding import free_in_sliding
 from ..model.structure import Structure
 from .critical import stability_limit
 from .mode_coupling import coalescence
 from .mode_following import HALVINGS, LOOKS, Sampler, match_modes
-from .several_contacts import free_closed_coordinates, one_contact
 from .system import with_axes
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def _limits(scene: Scene) -> dict:
         "mu_crit": ((), limit.mu, {"long_name": "critical friction", "units": "1", **said}),
         "frequency_crit": ((), limit.frequency, {"long_name": "frequency at the critical friction", "units": "Hz"}),
     }
-    if one_contact(scene.structure):
+    if len(scene.structure.contacts) == 1:
         meeting = coalescence(scene.structure, direction=direction).mu
         long_name = "friction at the coalescence of the undamped modes"
         found["mu_coalescence"] = ((), meeting, {"long_name": long_name, "units": "1"})
@@ -95,7 +96,7 @@ def _modes_dataset(scene: Scene, name: str, values: np.ndarray, followed: list) 
     import xarray as xr
 
     structure = scene.structure
-    n, keep = structure.size, free_closed_coordinates(structure)
+    n, keep = structure.size, free_in_sliding(in_contact_coordinates(structure))
     m = len(keep)
     eigenvalue, partner = np.full((2, len(values), m), np.nan, complex)
     shape = np.full((len(values), m, n), np.nan, complex)

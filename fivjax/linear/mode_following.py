@@ -8,7 +8,7 @@ import numpy as np
 from ..foundation.kept_programs import kept
 from ..foundation.precision import real
 from ..model.scene import Scene
-from .several_contacts import sliding_motion
+from .linearisation import sliding_motion
 from .spectrum import POINTS_AT_ONCE
 
 # How often an interval of an axis is halved to tell two modes apart; if that is not enough, they have met. Modes that coincide

@@ -1,8 +1,4 @@
-r"""Steady sliding of several contacts at once: its state matrix, and the friction at which it becomes unstable.
-
-All contacts slide, under one coefficient or with one each. With contacts at coordinates, the normal rows and columns are left
-out, and σμ times its normal row is subtracted from each tangential row, as in Eq. 3; friction that varies with slip speed adds
-a damper at each contact.
+"""The friction at which steady sliding of several contacts at once becomes unstable, under one coefficient.
 
 The feedback of one contact is of rank one, and all its limits are found at once (`crossings`). That of several contacts is not:
 here the growth rate is computed for many coefficients, and the first limit is then refined. An interval of instability narrower
@@ -15,53 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation.matrix_routines import eigenvalues
-from ..model.contact_coordinates import in_contact_coordinates
-from ..model.friction import slope_of
-from ..model.scene import Scene, sliding_friction, steady_sliding
-from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices
+from ..model.sliding import sliding_matrices
 from ..model.structure import Structure
 from .gradients import in_natural_units, significant_growth
-from .linearisation import linear_sliding, state_matrix, time_scale_of
+from .linearisation import state_matrix, time_scale_of
 from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER
 
 
-def one_contact(structure: Structure) -> bool:
-    """Whether there is one contact, at two coordinates, for which there are better methods than for several."""
-    return len(structure.contacts) == 1 and structure.contacts_at_coordinates
-
-
-def free_closed_coordinates(structure: Structure) -> np.ndarray:
-    """The coordinates, of `in_contact_coordinates`, that closed contacts leave free."""
-    return free_in_sliding(in_contact_coordinates(structure))
-
-
-def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"]]:
-    """The state matrix of a scene's steady sliding, and its normal forces in N; not finite where there is none."""
-    forces = jnp.atleast_1d(steady_sliding(scene, scene.load.final)[1])
-    if one_contact(scene.structure):
-        return linear_sliding(scene).matrix, forces
-    speed = jnp.broadcast_to(jnp.abs(scene.belt_speed), forces.shape)
-    friction = jnp.broadcast_to(sliding_friction(scene), forces.shape)
-    slopes = jnp.zeros_like(friction) if scene.friction.constant else forces * slope_of(scene.friction, speed)
-    return sliding_state_matrix(scene.structure, friction, slopes), forces
-
-
-def sliding_state_matrix(
-    structure: Structure, friction: Float[Array, " c"], slopes: Float[Array, " c"]
-) -> Float[Array, "m m"]:
-    """A of ż = A z with z = (x, ẋ), x the coordinates that closed contacts leave free.
-
-    `friction` is σμ of each contact, `slopes` the damping by friction that varies with slip speed, N dμ/dv in N·s/m.
-    """
-    structure = in_contact_coordinates(structure)
-    tangential, _ = contact_coordinates(structure)
-    mass, damping, stiffness = sliding_matrices(structure, friction)
-    along = free_closed_coordinates(structure)[:, None] == np.atleast_1d(tangential)
-    return state_matrix(mass, damping + jnp.diag(along @ slopes), stiffness)
-
-
 def _growth(structure: Structure, mu, direction) -> Float[Array, ""]:
-    matrix = sliding_state_matrix(structure, direction * mu, jnp.zeros_like(direction))
+    matrix = state_matrix(*sliding_matrices(structure, direction * mu))
     return significant_growth(in_natural_units(matrix, time_scale_of(structure, slice(None))))
 
 
@@ -86,7 +44,7 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
     halvings = 50
     low, high = jax.lax.fori_loop(0, halvings, bisect, ends)
     mu = jnp.where(always, 0.0, jnp.where(found, 0.5 * (low + high), jnp.inf))
-    values = eigenvalues(sliding_state_matrix(structure, direction * high, jnp.zeros_like(direction)))
+    values = eigenvalues(state_matrix(*sliding_matrices(structure, direction * high)))
     omega = jnp.max(jnp.where(values.real == jnp.max(values.real), jnp.abs(values.imag), 0.0))
     undamped = jnp.all(structure.damping == 0)
     flutter = jnp.where(undamped, COALESCENCE, FLUTTER)
@@ -114,7 +72,7 @@ def _(primals, tangents):
     at = jnp.where(usable, mu, 0.1)
 
     def growth(structure, mu):
-        matrix = sliding_state_matrix(structure, direction * mu, jnp.zeros_like(direction))
+        matrix = state_matrix(*sliding_matrices(structure, direction * mu))
         return jnp.max(eigenvalues(matrix).real)
 
     _, along_structure = jax.jvp(lambda s: growth(s, at), (structure,), (tangents[0],))

@@ -16,7 +16,7 @@ from ..foundation.precision import is_known, real, returning_numpy
 from ..model.scene import Scene, sliding_equilibrium
 from ..model.structure import Structure
 from .gradients import with_own_gradient
-from .several_contacts import sliding_motion
+from .linearisation import sliding_matrix, sliding_motion
 from .system import as_scene, check_direction
 
 # Points whose matrices are in memory together.
@@ -42,12 +42,7 @@ def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> 
         >>> fj.cea.linearisation(structure, 0.2).shape
         (4, 4)
     """
-    return _matrix(_check(system, mu, direction))
-
-
-@by_numpy
-def _matrix(scene):
-    return sliding_motion(scene)[0]
+    return sliding_matrix(_check(system, mu, direction))
 
 
 def _check(system, mu, direction) -> Scene:
