@@ -56,27 +56,51 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     derivatives of the two quantities come from `contact`, by automatic differentiation.
     """
     mechanics = Mechanics(scene)
-    if mechanics.several:
-        return _of_several(scene, mechanics)
     n, load = scene.structure.size, scene.load.final
     q, normal_force = steady_sliding(scene, load)
     equilibrium = jnp.concatenate([q, jnp.zeros(n, q.dtype)])
-    direction = jnp.sign(scene.belt_speed)
-    keep = sliding_states(n, mechanics.normal)
-    friction = direction * mechanics.friction(jnp.abs(scene.belt_speed))
+    direction, mu = jnp.sign(mechanics.belt_speed), mechanics.friction(jnp.abs(mechanics.belt_speed))
+    keep, mode = sliding_states(n, mechanics.normal), ModeForces(mechanics, Contact.sliding(direction), mu)
 
     def pressing(z):
-        return -physics.free_acceleration(mechanics, load, equilibrium.at[keep].add(z))[mechanics.normal]
+        free = physics.free_acceleration(mechanics, load, equilibrium.at[keep].add(z))
+        return mode.added(mechanics, free)[1] if mechanics.several else -free[mechanics.normal]
 
     def slip(z):
         return -direction * physics.relative_velocity(mechanics, equilibrium.at[keep].add(z))
 
     rest = jnp.zeros(len(keep), q.dtype)
-    # Friction enters the accelerations as  a = (…) + a_press χ(μ) d,  χ = σ(μ - μ₀) / (c(μ) c(μ₀)),  with c the normal
-    # compliance and d = G_nn M⁻¹e_t - G_nt M⁻¹e_n. Bounds on χ' and χ'' over slip speed follow from those on μ.
+    derivative = jax.jacfwd if mechanics.several else jax.grad
+    remainder = _remainder_of_several if mechanics.several else _remainder
+    columns, slope, curvature, reach = remainder(mechanics, direction * mu, normal_force)
+    return LinearSliding(
+        equilibrium=equilibrium,
+        matrix=state_matrix(*steady_matrices(scene, normal_force)),
+        # The motion without friction, which takes no energy from the belt.
+        frictionless=state_matrix(*sliding_matrices(scene.structure, jnp.zeros_like(mu))),
+        pressing=derivative(pressing)(rest),
+        pressing_margin=pressing(rest),
+        slip=derivative(slip)(rest),
+        slip_margin=slip(rest),
+        remainder=jnp.concatenate([jnp.zeros_like(columns), columns])[keep].T,
+        remainder_slope=slope,
+        remainder_curvature=curvature,
+        reach=reach,
+        direction=direction,
+        exists=jnp.all((normal_force > 0) & (direction != 0)) & jnp.all(jnp.isfinite(q)),
+        solvable=physics.slides_uniquely(mechanics),
+    )
+
+
+def _remainder(mechanics: Mechanics, friction: Float[Array, ""], _):
+    r"""The direction in which the remainder of the friction law acts, the bounds on it, and their reach.
+
+    Friction enters the accelerations as $a = (…) + a_{press} χ(μ) d$, $χ = σ(μ - μ_0) / (c(μ) c(μ_0))$, with $c$ the normal
+    compliance and $d = G_{nn} M^{-1} e_t - G_{nt} M^{-1} e_n$. Bounds on $χ'$ and $χ''$ over slip speed follow from those on μ.
+    """
     _, g_tn, g_nn = mechanics.compliance
     along = g_nn * mechanics.from_tangential - g_tn * mechanics.from_normal
-    speed = jnp.abs(scene.belt_speed)
+    direction, speed = jnp.sign(mechanics.belt_speed), jnp.abs(mechanics.belt_speed)
     slope, curvature = mechanics.friction.bounds(LOWEST_SLIP * speed)
     # The bounds hold while slip changes by less than this share of the belt speed, and so friction by no more than this.
     most = jnp.abs(friction) + slope * LOWEST_SLIP * speed
@@ -84,78 +108,32 @@ def linear_sliding(scene: Scene) -> LinearSliding:
         mechanics.normal_compliance(direction, jnp.zeros_like(most)), mechanics.normal_compliance(direction, most)
     )
     compliance = jnp.where(compliance > 0, compliance, 0.0)  # and then there is no bound
-    return LinearSliding(
-        equilibrium=equilibrium,
-        matrix=state_matrix(*steady_matrices(scene, normal_force)),
-        # The motion without friction, which takes no energy from the belt.
-        frictionless=state_matrix(*sliding_matrices(scene.structure, jnp.zeros_like(friction))),
-        pressing=jax.grad(pressing)(rest),
-        pressing_margin=pressing(rest),
-        slip=jax.grad(slip)(rest),
-        slip_margin=slip(rest),
-        remainder=jnp.concatenate([jnp.zeros(n, q.dtype), along])[keep],
-        remainder_slope=slope / compliance**2,
-        remainder_curvature=curvature / compliance**2 + 2 * jnp.abs(g_tn) * slope**2 / compliance**3,
-        reach=jnp.full_like(compliance, LOWEST_SLIP),
-        direction=direction,
-        exists=(normal_force > 0) & jnp.all(jnp.isfinite(q)) & (direction != 0),
-        solvable=physics.slides_uniquely(mechanics),
-    )
+    bound = curvature / compliance**2 + 2 * jnp.abs(g_tn) * slope**2 / compliance**3
+    return along, slope / compliance**2, bound, jnp.full_like(compliance, LOWEST_SLIP)
 
 
-def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
-    r"""`linear_sliding` of several contacts.
+def _remainder_of_several(mechanics: Mechanics, friction: Float[Array, " c"], normal_force: Float[Array, " c"]):
+    r"""`_remainder` of several contacts.
 
     With $D = \mathrm{diag}(σ_i μ_i)$, its value $D_0$ at equilibrium, $A_0 = G_{nn} + G_{nt} D_0$ and the forces
     $N_0(z) = -A_0^{-1} a_n(z)$ under $D_0$, the forces are $N = (I + X (D - D_0))^{-1} N_0$ with $X = A_0^{-1} G_{nt}$.
     Friction that differs from that at equilibrium adds the accelerations $M^{-1} P (D - D_0) N$, $P = W_t - (W_t D_0 + W_n) X$.
-    `remainder` has the columns of $M^{-1} P$. The remainder of the linearisation in column i is at most `remainder_slope` plus
-    half `remainder_curvature`, times the square of the largest deviation relative to its margin (`verdicts.sliding_proof`). The
-    other contacts' friction changes a contact's force through $X$, too: `reach` says up to which deviation none can lift off.
+    The directions are the columns of $M^{-1} P$. The remainder of the linearisation in column i is at most the first bound plus
+    half the second, times the square of the largest deviation relative to its margin (`verdicts.sliding_proof`). The other
+    contacts' friction changes a contact's force through $X$, too: the reach says up to which deviation none can lift off.
     """
-    n, load, law = scene.structure.size, scene.load.final, mechanics.friction
-    q, normal_force = steady_sliding(scene, load)
-    equilibrium = jnp.concatenate([q, jnp.zeros(n, q.dtype)])
-    direction, speed = jnp.sign(mechanics.belt_speed), jnp.abs(mechanics.belt_speed)
-    keep = sliding_states(n, mechanics.normal)
-    mu = law(speed)
-    dragging = direction * mu
-    mode = ModeForces(mechanics, Contact.sliding(direction), mu)
-
-    def pressing(z):
-        y = equilibrium.at[keep].add(z)
-        return mode.added(mechanics, physics.free_acceleration(mechanics, load, y))[1]
-
-    def slip(z):
-        return -direction * physics.relative_velocity(mechanics, equilibrium.at[keep].add(z))
-
-    rest = jnp.zeros(len(keep), q.dtype)
     _, g_tn, g_nn = mechanics.compliance
-    handed_on = solve(g_nn + g_tn.T * dragging, g_tn.T)
-    columns = mechanics.from_tangential - (mechanics.from_tangential * dragging + mechanics.from_normal) @ handed_on
-    slope, curvature = law.bounds(LOWEST_SLIP * speed)
-    forces = jnp.abs(normal_force)
+    handed_on = solve(g_nn + g_tn.T * friction, g_tn.T)
+    columns = mechanics.from_tangential - (mechanics.from_tangential * friction + mechanics.from_normal) @ handed_on
+    speed, forces = jnp.abs(mechanics.belt_speed), jnp.abs(normal_force)
+    slope, curvature = mechanics.friction.bounds(LOWEST_SLIP * speed)
     changes = jnp.abs(handed_on) * (slope * speed)
     most = LOWEST_SLIP * jnp.max(jnp.sum(changes, axis=1))
     added = jnp.max(forces + changes @ forces) / jnp.where(most < 0.9, 1 - most, 0.0)
     # Contact by contact, the forces then change by no more than this times that deviation.
     each = forces + changes @ (forces + LOWEST_SLIP * added)
-    return LinearSliding(
-        equilibrium=equilibrium,
-        matrix=state_matrix(*steady_matrices(scene, normal_force)),
-        frictionless=state_matrix(*sliding_matrices(scene.structure, jnp.zeros_like(dragging))),
-        pressing=jax.jacfwd(pressing)(rest),
-        pressing_margin=pressing(rest),
-        slip=jax.jacfwd(slip)(rest),
-        slip_margin=slip(rest),
-        remainder=jnp.concatenate([jnp.zeros((n, len(direction)), q.dtype), columns])[keep].T,
-        remainder_slope=slope * speed * added,
-        remainder_curvature=curvature * speed**2 * forces,
-        reach=jnp.minimum(LOWEST_SLIP, jnp.min(forces / each)),
-        direction=direction,
-        exists=jnp.all((normal_force > 0) & (direction != 0)) & jnp.all(jnp.isfinite(q)),
-        solvable=physics.slides_uniquely(mechanics),
-    )
+    reach = jnp.minimum(LOWEST_SLIP, jnp.min(forces / each))
+    return columns, slope * speed * added, curvature * speed**2 * forces, reach
 
 
 def sliding_rates(scene: Scene) -> Complex[np.ndarray, " m"]:
