@@ -98,13 +98,10 @@ def _is_a_limit(value):
 @functools.partial(with_own_gradient, exists=_is_a_limit)
 def _friction_limit(structure, direction):
     """That of a structure as it was given, so that its parameters' way into the matrices is differentiated with it."""
-    loop, _ = friction_loop(matrices_only(in_contact_coordinates(structure)), direction)
-    return first_limit(loop).gain
-
-
-@functools.partial(with_own_gradient, exists=_is_a_limit)
-def _friction_limit_of_several(structure, direction):
-    return critical_friction_of_several(matrices_only(in_contact_coordinates(structure)), direction)
+    own = matrices_only(in_contact_coordinates(structure))
+    if len(own.contacts) > 1:
+        return critical_friction_of_several(own, direction)
+    return first_limit(friction_loop(own, direction)[0]).gain
 
 
 @returning_numpy
@@ -135,20 +132,17 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     """
     own = _checked(structure, direction)
     given = matrices_only(own) if all(map(is_known, jax.tree.leaves(structure))) else structure
-    limit = _friction_limit if len(own.contacts) == 1 else _friction_limit_of_several
-    return limit(given, _along(own, direction))
+    return _friction_limit(given, _along(own, direction))
 
 
 @by_numpy_if_small
 def _stability_limit(structure, direction):
-    loop, scale = friction_loop(structure, direction)
-    limit = first_limit(loop)
-    return StabilityLimit(mu=limit.gain, frequency=limit.omega * scale / (2 * jnp.pi), code=limit.code)
-
-
-@by_numpy_if_small
-def _stability_limit_of_several(structure, direction):
-    mu, omega, code = first_limit_of_several(structure, direction)
+    if len(structure.contacts) > 1:
+        mu, omega, code = first_limit_of_several(structure, direction)
+    else:
+        loop, scale = friction_loop(structure, direction)
+        limit = first_limit(loop)
+        mu, omega, code = limit.gain, limit.omega * scale, limit.code
     return StabilityLimit(mu=mu, frequency=omega / (2 * jnp.pi), code=code)
 
 
@@ -168,8 +162,7 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
         (67.92, 'flutter')
     """
     own = _checked(structure, direction)
-    limit = _stability_limit if len(own.contacts) == 1 else _stability_limit_of_several
-    return limit(matrices_only(own), _along(own, direction))
+    return _stability_limit(matrices_only(own), _along(own, direction))
 
 
 @functools.partial(with_own_gradient, exists=_is_a_limit)
