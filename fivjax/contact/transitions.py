@@ -136,24 +136,23 @@ def _following(
         following = modes_from_forces(mechanics, load, y_next, going_on, jnp.where(over, state_of(contact), NONE))
         # What the event does not reach goes on: a contact whose mode ends at the same instant has an event of its own.
         reached = affected_by(mechanics, own)
-        status = jnp.where(reached, following.status, contact.status)
+        status = jnp.where(reached, following.status, contact.status).astype(contact.status.dtype)
         following = Contact(status, jnp.where(reached, following.direction, contact.direction))
     else:
         y_next = jnp.where(touched, struck(), y_stopped)
         following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK)
         status = jnp.where(lifted, Status.DETACH, following.status)
         rests = touched & (status != Status.DETACH)
-        landed = Contact(status.astype(contact.status.dtype), following.direction)
+        following = Contact(status.astype(contact.status.dtype), following.direction)
         rate = gap_rate(mechanics, y_stopped)
         # A rebound that counts as a landing as soon as it begins has its speed already.
         rebound = jnp.where(rate < 0, -mechanics.restitution, 1.0) * rate
 
         def rested():
-            by = after_brief_flights(mechanics, landed, load, y_next)
+            by = after_brief_flights(mechanics, following, load, y_next)
             return y_next.at[degrees_of_freedom(y) :].add(by * rebound)
 
         y_next = jax.lax.cond(rests, rested, lambda: y_next)
-    following = Contact(status.astype(contact.status.dtype), following.direction)
     return following, on_constraint(mechanics, following, y_next)
 
 

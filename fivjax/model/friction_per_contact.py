@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -75,17 +76,14 @@ class FrictionPerContact(AbstractFriction):
         return next_term
 
     def variation(self, slip_speed: Float[Array, " c"]) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-        return self._pairs(lambda law, slip: law.variation(slip), slip_speed)
+        return self._of_each(lambda law, slip: tuple(law.variation(slip)), slip_speed)
 
     def bounds(self, slip_speed: Float[Array, " c"]) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-        return self._pairs(lambda law, slip: law.bounds(slip), slip_speed)
+        return self._of_each(lambda law, slip: tuple(law.bounds(slip)), slip_speed)
 
     def _of_each(self, function, speeds):
-        return jnp.stack([function(law, speeds[..., i]) for i, law in enumerate(self.laws)], axis=-1)
-
-    def _pairs(self, function, speeds):
-        slopes, bends = zip(*(function(law, speeds[..., i]) for i, law in enumerate(self.laws)), strict=True)
-        return jnp.stack(slopes, axis=-1), jnp.stack(bends, axis=-1)
+        found = [function(law, speeds[..., i]) for i, law in enumerate(self.laws)]
+        return jax.tree.map(lambda *own: jnp.stack(own, axis=-1), *found)
 
     def __repr__(self) -> str:
         return repr(list(self.laws))
