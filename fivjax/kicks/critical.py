@@ -19,8 +19,7 @@ from ..maps.executors import with_workers
 from ..maps.groups import Limits
 from ..model.load import Pulse
 from ..model.scene import Scene
-from ..steppers.base import AbstractStepper
-from ..steppers.description import describe_method
+from ..steppers.base import AbstractStepper, describe_method
 from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict

@@ -9,8 +9,7 @@ from jaxtyping import Int
 
 from ..io.datasets import label, labelled
 from ..model.scene import Scene
-from ..steppers.base import AbstractStepper
-from ..steppers.description import describe_method
+from ..steppers.base import AbstractStepper, describe_method
 from ..verdicts.sliding_proof import why_withheld
 from ..verdicts.verdict import FAILURES, MEANING, RESTS_ON, Proof, Verdict
 from .crossing import first_crossings

@@ -154,7 +154,7 @@ def check_matrices(
     lowest = 10
     if both and not np.any(loose):
         with contextlib.suppress(np.linalg.LinAlgError):
-            values = lowest_eigenvalues(stiffness, mass, lowest)
+            values, _ = lowest_modes(stiffness, mass, lowest)
             rigid = int(np.sum(np.abs(values) <= RIGID * np.abs(values).max(initial=0.0)))
             frequencies = tuple(float(f) for f in np.sqrt(np.maximum(values, 0.0)) / (2 * np.pi))
     total = None
@@ -220,15 +220,10 @@ def negative_eigenvalues(matrix, multipliers=None) -> int | None:
     return int(np.sum(factors.U.diagonal() < 0))
 
 
-def lowest_eigenvalues(stiffness, mass, count: int) -> np.ndarray:
-    """The lowest eigenvalues ω² of K v = ω² M v, sorted; both symmetric. Fewer than asked for in small structures."""
-    return lowest_modes(stiffness, mass, count)[0]
-
-
 def lowest_modes(stiffness, mass, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The lowest eigenvalues ω² of K v = ω² M v and their mass-normalised modes (columns), sorted.
 
-    K may be indefinite, as Lagrange multipliers make it.
+    Fewer than asked for in small structures. Both matrices are symmetric; K may be indefinite, as Lagrange multipliers make it.
 
     **Raises:** `LinAlgError` where K + σM is singular for every σ, and where M has negative eigenvalues.
     """

@@ -28,8 +28,7 @@ from ..foundation.progress import following, tick
 from ..io.datasets import labelled
 from ..model.contact_coordinates import transformation
 from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
-from ..steppers.base import MOST_ADVANCES, AbstractStepper
-from ..steppers.description import describe_method
+from ..steppers.base import MOST_ADVANCES, AbstractStepper, describe_method
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 from .ending import ENDING, Ending

@@ -152,3 +152,9 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
 
     def func(self, terms, t0, y0: State, args: Scene) -> State:
         return terms.vf(t0, y0, args)
+
+
+def describe_method(method: AbstractStepper) -> str:
+    """A method with its inner solver and its step, for the provenance of results: "WhereSwitched(Tsit5, dt=0.0001)"."""
+    inner = getattr(method, "solver", None)
+    return f"{type(method).__name__}({'' if inner is None else type(inner).__name__ + ', '}dt={method.dt:g})"
