@@ -1,7 +1,8 @@
 """Matrix Market files: a line that says what follows, a line of sizes, and a line for each entry.
 
 Read here, line by line as the format says (Boisvert, Pozo, Remington: The Matrix Market Exchange Formats, NISTIR 5935), because
-the readers at hand believe the sizes, and fall over damaged lines.
+the readers at hand believe the sizes, and pass over what is wrong: of an entry `1.0D+02` SciPy's reads 1, and of a symmetric
+matrix that gives both triangles twice the entries.
 """
 
 import io
