@@ -182,3 +182,16 @@ def test_output4_is_read_without_the_other_modules_of_its_library(tmp_path):
     imported = set(done.stdout.split())
     assert "pyyeti.nastran.op4" in imported
     assert not imported & {"pyyeti.nastran.bulk", "matplotlib", "pandas", "numba"}
+
+
+def test_what_other_readers_of_matrix_market_files_pass_over(tmp_path):
+    """Exponents of Fortran's, of which they read the number before; both triangles of a symmetric matrix, which they add up."""
+    path, head = tmp_path / "K.mtx", "%%MatrixMarket matrix coordinate real"
+    path.write_text(f"{head} general\n2 2 2\n1 1 1.0D+02\n2 2 -2.5d-1\n")
+    assert fj.read_matrices(path)["K"].matrix.toarray().tolist() == [[100.0, 0.0], [0.0, -0.25]]
+    path.write_text(f"{head} symmetric\n2 2 4\n1 1 3.0\n2 1 1.0\n1 2 1.0\n2 2 3.0\n")
+    with pytest.raises(ValueError, match="it is symmetric, but gives row 2, column 1 and its mirror image, too"):
+        fj.read_matrices(path)
+    path.write_text(f"{head} general\n2 2 1\n1 1 2.0 7\n")
+    with pytest.raises(ValueError, match="an entry must have 1 numbers as its value, but has 2"):
+        fj.read_matrices(path)
