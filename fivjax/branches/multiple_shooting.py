@@ -199,10 +199,9 @@ def images_along(scene: Scene, directions: Sequence[Scene], modes, following, y,
     # Directions of the derivatives: those of the state, the duration, the parameters.
     total = size + 1 + len(directions)
     units = np.eye(total)
-    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), total)), _first(own))
     none = jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)), directions[0])
     of_parameters = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *[none] * (size + 1), *directions)
-    along = of_parameters, units[:size], units[size], still[2]
+    along = of_parameters, units[:size], units[size], None
     found = _image.derived((scene,), along, own=own, by_kernel=by_kernel)
     ((y, guard), _), ((to, of_guard), _) = found
 
@@ -235,10 +234,6 @@ def _filled(own, by_kernel: bool):
     count = len(jax.tree.leaves(own)[0])
     fill = np.minimum(np.arange(power_of_4(max(count, least))), count - 1)
     return jax.tree.map(lambda leaf: leaf[fill], own)
-
-
-def _first(own):
-    return jax.tree.map(lambda leaf: leaf[0], own)
 
 
 def _image_of_phase(args, numbers):

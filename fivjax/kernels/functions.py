@@ -63,12 +63,12 @@ class KernelFunction:
     def derived(self, args: tuple, directions, instants=NO_ROWS, *, own: tuple = (), by_kernel: bool = True):
         """The results for known values, as a call gives them, and the derivatives of real ones along directions.
 
-        `directions` is a tree like the arguments of one trajectory, with one more, last axis over the directions; what is zero
-        in all of them is not perturbed. In the tree of derivatives, results that are not real are None.
+        `directions` is a tree like the arguments of one trajectory, with one more, last axis over the directions; what is None
+        there, or zero in all of them, is not perturbed. In the tree of derivatives, results that are not real are None.
         """
         refuse_if_forked()
         form, common, each = _parts(args, own)
-        dots = [np.asarray(dot, float) for dot in Form.of(directions)[1]]
+        dots = [np.asarray(dot, float) for dot in Form.of(_filled(directions, (*args, *_first(own))))[1]]
         if not by_kernel:
             found, slopes = self._by_xla(form, *_typed(form, common, each), instants, dots)
             return jax.tree.map(known_to_numpy, found), jax.tree.map(known_to_numpy, slopes)
@@ -82,9 +82,8 @@ class KernelFunction:
 
     def derived_by(self, args: tuple, leaf: np.ndarray, directions, instants=NO_ROWS, *, by_kernel: bool = True):
         """The same, along directions of one of the arguments' arrays, which is this very `leaf`."""
-        count = directions.shape[-1]
-        still = jax.tree.map(lambda own: directions if own is leaf else np.zeros((*np.shape(own), count)), args)
-        return self.derived(args, still, instants, by_kernel=by_kernel)
+        along = jax.tree.map(lambda own: directions if own is leaf else None, args)
+        return self.derived(args, along, instants, by_kernel=by_kernel)
 
     def of_many(
         self,
@@ -170,8 +169,21 @@ def _parts(args: tuple, own: tuple) -> tuple[Form, list, list]:
     """The form of one trajectory's arguments, the arrays that all share, and those that each has for itself."""
     if not own:
         return *Form.of(args), []
-    first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
-    return Form.of((*args, *first))[0], Form.of(args)[1], Form.of(own)[1]
+    return Form.of((*args, *_first(own)))[0], Form.of(args)[1], Form.of(own)[1]
+
+
+def _first(own: tuple) -> tuple:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
+
+
+def _filled(directions, args: tuple):
+    """The directions, with zeros where they are None."""
+    count = jax.tree.leaves(directions)[0].shape[-1]
+
+    def known(own, part):
+        return jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), count)), part) if own is None else own
+
+    return jax.tree.map(known, directions, args, is_leaf=lambda own: own is None)
 
 
 def _rows(common, each) -> Float[np.ndarray, "lanes numbers"]:

@@ -147,7 +147,8 @@ def least_crossings(kicked: Kicked, p: Float[np.ndarray, " kicks"], tolerance: f
     the others. Kicks far above the smallest that lead to a limit cycle need no verdict.
     """
     rows = len(next(iter(kicked.columns.values())))
-    found = FirstCrossing(*np.full((3, rows), np.nan), np.zeros(rows, int))
+    low, high, middle = np.full((3, rows), np.nan)
+    found = FirstCrossing(low, high, middle, np.zeros(rows, int))
     left, begin = np.arange(rows), 0
     for share in (1 / 8, 1 / 4, 1 / 2, 1):
         end = max(begin + 2, math.ceil(share * len(p)))

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,42 +39,40 @@ def kicked(scene: Scene, directions: Scene, crossings: int) -> Crossings:
     each = np.shape(contact_coordinates(scene.structure)[0])
     direction = np.broadcast_to(np.sign(np.asarray(scene.belt_speed, float)), each)
     start = Point(np.zeros(2 * scene.structure.size), Contact.sliding(direction))
-    return _followed(scene, directions, start, None, crossings)
+    return _followed(scene, start, (_last(directions), None), crossings)
 
 
 def returned(scene: Scene, directions: Scene, point: Point, crossings: int) -> Crossings:
     """Crossings of the motion from a point of the section, without a kick."""
     quiet = scene.replace(p=1.0, duration=0.0)
-    return _followed(quiet, directions, point, None, crossings)
+    return _followed(quiet, point, (_last(directions), None), crossings)
 
 
 def started(scene: Scene, start: Point, directions: Float[np.ndarray, "d state"], crossings: int) -> Crossings:
     """Crossings of the motion from any state, without a kick, with derivatives along directions of that state."""
     quiet = scene.replace(p=1.0, duration=0.0)
-    fixed = jax.tree.map(lambda leaf: np.zeros((len(directions), *np.shape(leaf))), quiet)
-    return _followed(quiet, fixed, start, directions, crossings)
+    return _followed(quiet, start, (None, Point(directions.T, None)), crossings)
 
 
-def _followed(scene: Scene, directions: Scene, start: Point, of_start, crossings: int) -> Crossings:
+def _followed(scene: Scene, start: Point, along: tuple, crossings: int) -> Crossings:
+    """`along`: directions of the scene and of the start."""
     by_kernel, wanted = has_kernel(scene, EXACT_STEPPER), crossings
     if not by_kernel:
         # XLA compiles a program for each number of rows.
         wanted = MOST_CROSSINGS
     args = scene, jax.tree.map(known_to_numpy, start), np.int32(crossings)
-    along = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf, float), 0, -1), directions)
-    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), _count(directions))), args)
-    moving = along, still[1], still[2]
-    if of_start is not None:
-        moving = eqx.tree_at(lambda args: args[1].y, moving, of_start.T)
-    (end, rows), (_, slopes) = _motion_after_kick.derived(args, moving, np.arange(1.0, wanted + 1), by_kernel=by_kernel)
+    (end, rows), (_, slopes) = _motion_after_kick.derived(
+        args, (*along, None), np.arange(1.0, wanted + 1), by_kernel=by_kernel
+    )
     at, contact = rows.point, rows.point.contact
     return Crossings(
         at.y, np.moveaxis(slopes.point.y, -1, 0), contact.status, contact.direction, rows.events, int(end.crossed)
     )
 
 
-def _count(directions) -> int:
-    return len(jax.tree.leaves(directions)[0])
+def _last(directions: Scene) -> Scene:
+    """The directions along the last axis."""
+    return jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf, float), 0, -1), directions)
 
 
 def _after_kick(args, numbers, method=EXACT_STEPPER):

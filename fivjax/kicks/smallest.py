@@ -212,7 +212,7 @@ def smallest_kick(
     tried = sorted((float(seen.middle[k]), float(starts[k]), int(k)) for k in known)[:descents]
     p, duration, best = tried[0]
     if "duration" in free:
-        p, duration = min(_descended(scene, *one, float(shortest), float(longest)) for *one, _ in tried)
+        p, duration = min(_descended(scene, q, d, float(shortest), float(longest)) for q, d, _ in tried)
     at = critical_perturbation(
         scene, duration=[duration], p_range=(p - 1e-4, p + 1e-4), p_step=1e-4, derivatives=True, progress=False
     ).isel(duration=0)

@@ -250,8 +250,7 @@ def _guard(
     along = jax.tree.map(
         lambda leaf: np.moveaxis(np.pad(leaf, [(1, 0)] + [(0, 0)] * (leaf.ndim - 1)), 0, -1), directions
     )
-    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), 1 + count)), args)
-    moving = along, np.append(1.0, moves), *still[2:]
+    moving = along, np.append(1.0, moves), None, None
     by_kernel = has_kernel(scene, EXACT_STEPPER)
     (value, _), (slopes, _) = _to_guard.derived(args, moving, by_kernel=by_kernel)
     return float(value), float(slopes[0]), slopes[1:]
