@@ -143,8 +143,8 @@ class Scan(NamedTuple):
 
 
 def least_crossings(kicked: Kicked, p: Float[np.ndarray, " kicks"], tolerance: float, wanted: int) -> FirstCrossing:
-    """The first crossings of those scenes whose are the smallest, `wanted` of them or more, narrowed to the tolerance; NaN for
-    the others. Kicks far above the smallest that lead to a limit cycle need no verdict.
+    """The first crossings of the scenes, the smallest of them, as many as are `wanted` or more, narrowed to the tolerance; NaN
+    for the others. Kicks far above the smallest that lead to a limit cycle need no verdict.
     """
     rows = len(next(iter(kicked.columns.values())))
     low, high, middle = np.full((3, rows), np.nan)

@@ -60,10 +60,8 @@ class SmallestKick(NamedTuple):
     p: float  # of the smallest kick found that leads to a limit cycle
     duration: float  # of that kick, s
     certified: float  # every kick with p between 1 and this slides for ever, for all durations within the bounds
-    proved_low: (
-        float  # a kick of the same duration with this p was proved to slide (NaN: p is the least of the bounds),
-    )
-    proved_high: float  # and one with this p to end on a limit cycle
+    proved_low: float  # a kick of the same duration with this p was proved to slide; NaN where p is its lower bound
+    proved_high: float  # one with this p was proved to end on a limit cycle
     scene: Scene | None = None  # the one that was asked about
 
     def in_scene(self, scene: Scene, turned: Callable[[np.ndarray], np.ndarray]) -> "SmallestKick":
