@@ -101,8 +101,8 @@ def _multipliers(axes: Axes, cycle: LimitCycle) -> None:
 def _section(axes: Axes, cycle: LimitCycle, contact: int) -> None:
     structure = cycle.scene.structure
     tangential, normal = structure.tangential_directions[:, contact], structure.normal_directions[:, contact]
-    # Upwards a coordinate that is not the contact's own, if there is one.
-    second = int(np.argmin((tangential != 0) | (normal != 0)))
+    # Upwards a coordinate that is not the contact's own, if there is one, else a normal one: on the section others stand still.
+    second = int(np.lexsort((normal != 0, tangential != 0))[0])
     moved = np.flatnonzero(tangential)
     first = structure.coordinates[moved[0]] if len(moved) == 1 else f"tangential displacement of contact {contact}"
     n = structure.size

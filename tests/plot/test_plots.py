@@ -357,3 +357,11 @@ def test_the_points_of_a_torus_are_drawn_along_the_belt_of_the_contact_shown(str
     draw_section(axes, SimpleNamespace(scene=SimpleNamespace(structure=structure), points=points), contact)
     expected = 1e3 * points[:, : structure.size] @ structure.tangential_directions[:, contact]
     np.testing.assert_array_equal(axes.lines[0].get_xdata(), expected)
+
+
+def test_upwards_is_what_moves_on_the_section():
+    """Of two coordinates the tangential one has no velocity there."""
+    structure = fj.Structure(np.eye(2), np.eye(2), 1e4 * np.eye(2), [0.0, -1.0], tangential=0, normal=1)
+    points, axes = np.random.default_rng(0).normal(size=(5, 4)), Figure().subplots()
+    draw_section(axes, SimpleNamespace(scene=SimpleNamespace(structure=structure), points=points), 0)
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), points[:, 3])
