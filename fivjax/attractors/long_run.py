@@ -92,12 +92,12 @@ class _Underway(NamedTuple):
 def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray, " m"], slides: Slides | None) -> Fates:
     """The same of motions that nothing has captured by now: those without events are most likely slow to fade."""
     count = len(motions.group)
-    attractor: dict[int, CapturingSet] = {}
     run = _Underway(motions, np.zeros(count), np.zeros(count, int))
-    without_events = np.zeros(count, bool) if slides is None else _slide_on(catalogue, run, attractor, slides)
-    found = Fates(np.zeros(count, bool), attractor, without_events, run.motions.at, run.time, run.changes)
-    left = ~without_events
-    left[list(attractor)] = False
+    found = Fates(np.zeros(count, bool), {}, np.zeros(count, bool), run.motions.at, run.time, run.changes)
+    if slides is not None:
+        found.without_events[:] = _slide_on(catalogue, run, found.attractor, slides)
+    left = ~found.without_events
+    left[list(found.attractor)] = False
     rows = np.flatnonzero(left)
     if len(rows):
         found.put(rows, _long_fates(catalogue, run.motions.rows(rows), onward[rows], slides))

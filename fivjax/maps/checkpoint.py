@@ -60,13 +60,12 @@ class Checkpoint:
     **Raises:** as `read_checkpoint`.
     """
 
-    def __init__(self, path: str | Path, run: dict, total: int, energy: bool):
-        self.path, self.run, self.total, self.energy = Path(path), run, total, energy
+    def __init__(self, path: Path, run: dict, total: int, energy: bool):
+        self.path, self.run, self.total, self.energy = path, run, total, energy
         self.verdicts, self.found = not_run(0, energy), {}
         # The indices of the results, in rising order; and those of jobs since then, with theirs.
         self._places, self._more = np.zeros(0, np.int64), []
         self._new, self._done, self._took = False, [], 0.0
-        check_writable(path)
         self._lock = self._locked()
         try:
             self._read()
@@ -188,15 +187,14 @@ def jobs_beside(path: Path) -> Path:
     return path.with_name(f"{path.name}.jobs")
 
 
-def read_checkpoint(path: str | Path, run: dict) -> Contents | None:
+def read_checkpoint(path: Path, run: dict) -> Contents | None:
     """What is kept in a checkpoint; None if there is no such file yet.
 
     `run` describes the run in plain Python values (that `json` can hold).
 
-    **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a file that is no checkpoint, one
-    whose list of contents is damaged, and the checkpoint of another run, naming the first difference.
+    **Raises:** `ValueError`, before any work is done, for a file that is no checkpoint, one whose list of contents is
+    damaged, and the checkpoint of another run, naming the first difference.
     """
-    path = check_writable(path)
     if not path.exists():
         return None
     try:

@@ -8,7 +8,7 @@ from matplotlib.lines import Line2D
 
 from ..foundation import arguments
 from ..foundation.quantities import QUANTITIES
-from ..simulation.trajectory import Trajectory
+from ..simulation.trajectory import OF_COORDINATES, Trajectory
 from .contact_status import mark_kick, shade_status
 from .style import (
     BLACK,
@@ -177,8 +177,5 @@ def comparison(
 
 
 def _of(run: Trajectory, quantity: str) -> np.ndarray:
-    if quantity not in ("displacement", "velocity", "acceleration"):
-        raise ValueError(
-            f'Argument `quantity` must be one of "displacement", "velocity", "acceleration", but is {quantity!r}.'
-        )
+    arguments.one_of("quantity", quantity, OF_COORDINATES)
     return np.asarray(getattr(run, quantity))

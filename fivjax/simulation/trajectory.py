@@ -290,7 +290,7 @@ def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
     if y0 is not None:
         y0 = start_in_contact_coordinates(scene, y0)
     run = simulate(inner, *how, y0=y0, **options)
-    rows = {name: getattr(run, name) @ x.T for name in ("displacement", "velocity", "acceleration")}
+    rows = {name: getattr(run, name) @ x.T for name in OF_COORDINATES}
     return dataclasses.replace(run, **rows, scene=scene)
 
 
