@@ -14,7 +14,7 @@ from ..contact import Status
 from ..section.return_maps import ReturnMaps, Section
 from .closing import Closed, close
 from .motions import Motions
-from .neighbourhood import LARGEST, CycleTrial, Neighbourhood, ReturnImages, cycle_trial, neighbourhoods, side_by_side
+from .neighbourhood import LARGEST, CycleTrial, Neighbourhood, ReturnImages, cycle_trials, neighbourhoods, side_by_side
 
 # Crossings of the section in one period: of cycles that are sought first; of those on a torus that is locked to them; and of
 # those on which neighbours close in.
@@ -95,13 +95,17 @@ def stable_cycles(
             rows_of.append([near[row]])
     before = [cycle_through(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
     largest = np.max(np.abs(np.linalg.eigvals(closed.jacobian[kept])), axis=1)
-    found, stable, trials = [], [], []
+    found, new = [], []
     for k, row in enumerate(kept):
         if before[k] is not None:
             found.append((int(group[near[row]]), np.array(rows_of[k]), before[k]))
-        elif recurrence.attracts_soon(largest[k], lag[row]) and (attempt := _trial(maps, closed, row, recurrence)):
-            stable.append(k)
-            trials.append(attempt)
+        elif recurrence.attracts_soon(largest[k], lag[row]):
+            new.append(k)
+    if not new:
+        return found
+    attempts = _trials(maps, closed, np.array(kept)[new], recurrence)
+    stable = [k for k, attempt in zip(new, attempts, strict=True) if attempt is not None]
+    trials = [attempt for attempt in attempts if attempt is not None]
     if not stable:
         return found
     chosen = np.array(kept)[stable]
@@ -170,16 +174,22 @@ def _passes(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], points: Float[np.ndar
     return bool(apart < 1e-6 * np.linalg.norm(maps.weights * y))
 
 
-def _trial(maps: ReturnMaps, closed: Closed, row: int, recurrence: Recurrence) -> CycleTrial | None:
-    y, status, direction = closed.at.rows(row)
-    free = maps.free_directions(status, y)
-    found = cycle_trial(y, status, direction, closed.jacobian[row], maps.weights * _just_opened(maps, y, status), free)
-    if found is None or closed.crossings[row] <= CROSSINGS:
-        return found
+def _trials(
+    maps: ReturnMaps, closed: Closed, rows: Int[np.ndarray, " m"], recurrence: Recurrence
+) -> list[CycleTrial | None]:
+    """The checks to be made for these of the cycles."""
+    at = closed.at.rows(rows)
+    weights = np.array([maps.weights * _just_opened(maps, *one) for one in zip(at.y, at.status, strict=True)])
+    found = cycle_trials(at, closed.jacobian[rows], weights, maps.free_directions(at.status, at.y))
     # A cycle of many crossings that captures only what is nearer than this lies on a torus that is locked weakly.
-    smallest = found.smallest if recurrence.settled else 1e-3 / LARGEST * found.largest
-    # Its points lie close together.
-    return found._replace(smallest=smallest, largest=found.largest / 8)
+    least = 0.0 if recurrence.settled else 1e-3 / LARGEST
+    return [
+        one
+        if one is None or count <= CROSSINGS
+        # Its points lie close together.
+        else one._replace(smallest=max(one.smallest, least * one.largest), largest=one.largest / 8)
+        for one, count in zip(found, closed.crossings[rows], strict=True)
+    ]
 
 
 def _just_opened(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], status) -> Float[np.ndarray, " 2n"]:

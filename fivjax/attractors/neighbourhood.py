@@ -45,6 +45,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..contact import same_mode
+from ..section.return_maps import Section
 
 # The largest radius tried, relative to the cycle's size.
 LARGEST = 0.5
@@ -89,28 +90,32 @@ class ReturnImages(NamedTuple):
 ReturnMap = Callable[[Int[np.ndarray, " c"], Float[np.ndarray, "c m state"]], ReturnImages]
 
 
-def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray, "f f"], float] | None:
-    """A square root of $H$ (see the module's docstring) and the rate γ; None if the largest multiplier is too close to 1."""
+def adapted_norms(
+    derivatives: Float[np.ndarray, "m f f"],
+) -> tuple[Float[np.ndarray, "m f f"], Float[np.ndarray, " m"]]:
+    """Square roots of $H$ (see the module's docstring), and the rates γ: NaN where the largest multiplier is too close to 1."""
     # With multipliers closer than this to the unit circle, a contraction could not be told from rounding.
     margin = 1e-6
-    if not np.all(np.isfinite(derivative)):
-        return None
-    largest = np.max(np.abs(np.linalg.eigvals(derivative)), initial=0.0)
-    if largest >= 1 - margin:
-        return None
-    rate = 0.5 * (1 + largest)
+    finite = np.all(np.isfinite(derivatives), axis=(1, 2))
+    derivatives = np.where(finite[:, None, None], derivatives, 0.0)
+    largest = np.max(np.abs(np.linalg.eigvals(derivatives)), axis=1, initial=0.0)
+    rate = np.where(finite & (largest < 1 - margin), 0.5 * (1 + largest), np.nan)
     # The solution is a sum over all powers of the scaled derivative, whose number is doubled again and again.
-    power, matrix = derivative / rate, np.eye(len(derivative))
+    matrix, left = np.tile(np.eye(derivatives.shape[1]), (len(rate), 1, 1)), np.flatnonzero(np.isfinite(rate))
+    power = derivatives[left] / rate[left, None, None]
     # Enough for the slowest decay within the margin: (1 - margin / 2) to the power 2^32 is nothing.
     for _ in range(32):
-        matrix, power = matrix + power.T @ matrix @ power, power @ power
-        if np.max(np.abs(power), initial=0.0) < np.finfo(float).eps:
-            break
-    try:
-        # NumPy gives the lower Cholesky factor; its transpose is the root that acts on columns.
-        return np.linalg.cholesky(0.5 * (matrix + matrix.T)).T, rate
-    except np.linalg.LinAlgError:
-        return None
+        matrix[left] += np.swapaxes(power, 1, 2) @ matrix[left] @ power
+        power = power @ power
+        lasts = np.max(np.abs(power), axis=(1, 2), initial=0.0) >= np.finfo(float).eps
+        left, power = left[lasts], power[lasts]
+    for k, one in enumerate(0.5 * (matrix + np.swapaxes(matrix, 1, 2))):
+        try:
+            # NumPy gives the lower Cholesky factor; its transpose is the root that acts on columns.
+            matrix[k] = np.linalg.cholesky(one).T
+        except np.linalg.LinAlgError:
+            matrix[k], rate[k] = np.eye(len(one)), np.nan
+    return matrix, rate
 
 
 class CycleTrial(NamedTuple):
@@ -127,39 +132,36 @@ class CycleTrial(NamedTuple):
     smallest: float | Float[np.ndarray, " c"]  # the last one
 
 
-def cycle_trial(
-    centre: Float[np.ndarray, " state"],
-    status: int | np.integer | Int[np.ndarray, " c"],
-    direction: float | Float[np.ndarray, " c"],
-    jacobian: Float[np.ndarray, "state state"],
-    weights: Float[np.ndarray, " state"],
-    basis: Float[np.ndarray, "state f"],
-) -> CycleTrial | None:
-    """The check to be made for a cycle; None if it is not stable by a margin. (Uncoupled oscillators have a second multiplier
-    of 1, for a shift in time between them, so there is no check to make.)
+def cycle_trials(
+    at: Section,
+    jacobian: Float[np.ndarray, "m state state"],
+    weights: Float[np.ndarray, "m state"],
+    bases: list[Float[np.ndarray, "state _"]],
+) -> list[CycleTrial | None]:
+    """The check to be made for each of these cycles; None if it is not stable by a margin. (Uncoupled oscillators have a second
+    multiplier of 1, for a shift in time between them, so there is no check to make.)
 
-    **Arguments:** `centre`, the cycle's state on the section; `status` and `direction`, its contact mode; `jacobian`, the
-    derivative of the return map there; `weights` of the state's coordinates; `basis`, the weighted directions that are free on
-    the section (`ReturnMaps.free_directions`). States are deviations from the sliding equilibrium.
+    **Arguments:** `at`, the cycles' states on the section, deviations from the sliding equilibrium, with their contact modes;
+    `jacobian`, the derivatives of the return map there; `weights` of the states' coordinates; `bases`, the weighted directions
+    that are free on the section (`ReturnMaps.free_directions`).
     """
-    found = adapted_norm(basis.T @ (weights[:, None] * jacobian / weights) @ basis)
-    size = float(np.linalg.norm(weights * centre))
-    if found is None or size == 0:
-        return None
-    root, rate = found
-    outwards = sphere_directions(basis.shape[1], len(weights))
-    return CycleTrial(
-        centre,
-        status,
-        direction,
-        (basis @ root @ basis.T + np.eye(len(weights)) - basis @ basis.T) * weights,
+    found: list[CycleTrial | None] = [None] * len(bases)
+    sizes, free = np.linalg.norm(weights * at.y, axis=1), np.array([basis.shape[1] for basis in bases], int)
+    for count in np.unique(free).tolist():
+        rows = np.flatnonzero(free == count)
+        basis, own = np.array([bases[k] for k in rows]), weights[rows]
+        outwards = sphere_directions(count, weights.shape[1])
+        across = np.swapaxes(basis, 1, 2)
+        root, rate = adapted_norms(across @ (own[:, :, None] * jacobian[rows] / own[:, None]) @ basis)
+        norm = (basis @ root @ across + np.eye(weights.shape[1]) - basis @ across) * own[:, None]
         # Points of the unit sphere in the norm, as deviations of the state.
-        np.linalg.solve(root, outwards.T).T @ basis.T / weights,
-        np.linalg.norm(outwards, axis=1),
-        0.5 * (1 + rate),
-        LARGEST * size,
-        1e-8 * size,
-    )
+        steps = np.swapaxes(np.linalg.solve(root, outwards.T), 1, 2) @ across / own[:, None]
+        lengths = np.linalg.norm(outwards, axis=1)
+        for k, row in enumerate(rows.tolist()):
+            if np.isfinite(rate[k]) and sizes[row] > 0:
+                largest, smallest, allowed = LARGEST * sizes[row], 1e-8 * sizes[row], 0.5 * (1 + rate[k])
+                found[row] = CycleTrial(*at.rows(row), norm[k], steps[k], lengths, allowed, largest, smallest)
+    return found
 
 
 def neighbourhoods(trials: list[CycleTrial], returned: ReturnMap) -> list[Neighbourhood | None]:
@@ -174,19 +176,24 @@ def neighbourhoods(trials: list[CycleTrial], returned: ReturnMap) -> list[Neighb
     events = returned(np.arange(len(trials)), every.centre[:, None]).events
     # An ellipsoid's shells but the last are the outer ones of the next smaller one, so each is checked once.
     count = np.floor(np.log2(every.largest / every.smallest)).astype(int) + SHELLS
-    passed = np.arange(np.max(count)) < count[:, None]  # [cycle, shell], from outside
-    contraction = np.full(passed.shape, np.nan)
+    passed = np.arange(np.max(count)) < count[:, None]  # [cycle, shell], from outside; by all points that were checked
+    contraction, stage = np.zeros(passed.shape), np.zeros(passed.shape, int)
+    points = np.arange(every.steps.shape[1])
+    # More and more points: most shells that fail do so at the first ones.
+    of_stage = points[::32], np.setdiff1d(points[::8], points[::32]), np.setdiff1d(points, points[::8])
 
-    def check(rows: Int[np.ndarray, " m"], shell: Int[np.ndarray, " m"], one_in: int):
-        """Tries one in so many points of these shells; which shells pass, and their ratios."""
-        ratios = _contraction(every, rows, one_in, every.largest[rows] * 0.5**shell, events[rows], returned)
-        # NaN is not below anything, so it fails.
-        passed[rows, shell] = good = ratios <= every.allowed[rows]
-        return rows[good], shell[good], ratios[good]
+    def check(rows: Int[np.ndarray, " m"], shell: Int[np.ndarray, " m"], now: int) -> None:
+        """Tries those of these shells whose turn it is in the points of this stage."""
+        asked = passed[rows, shell] & (stage[rows, shell] == now)
+        rows, shell = rows[asked], shell[asked]
+        if len(rows):
+            ratios = _contraction(every, rows, of_stage[now], every.largest[rows] * 0.5**shell, events[rows], returned)
+            contraction[rows, shell] = ratios = np.maximum(contraction[rows, shell], ratios)
+            # NaN is not below anything, so it fails.
+            passed[rows, shell], stage[rows, shell] = ratios <= every.allowed[rows], now + 1
 
-    # A few points of all shells are tried first, at once.
-    rows, shell = np.nonzero(passed)
-    check(rows, shell, 32)
+    # First those of which one passes mostly, at once.
+    check(*np.nonzero(passed[:, :12]), 0)
     while True:
         runs = np.all(np.lib.stride_tricks.sliding_window_view(passed, SHELLS, axis=1), axis=2)
         left = np.flatnonzero(np.any(runs, axis=1) & np.array([one is None for one in found]))
@@ -194,33 +201,29 @@ def neighbourhoods(trials: list[CycleTrial], returned: ReturnMap) -> list[Neighb
             return found
         outermost = np.argmax(runs[left], axis=1)
         rows, shell = np.repeat(left, SHELLS), (outermost[:, None] + np.arange(SHELLS)).ravel()
-        fresh = np.isnan(contraction[rows, shell])
-        rows, shell, _ = check(rows[fresh], shell[fresh], 8)
-        rows, shell, ratios = check(rows, shell, 1)
-        contraction[rows, shell] = ratios
+        for now in range(len(of_stage)):
+            check(rows, shell, now)
         for k, j in zip(left.tolist(), outermost.tolist(), strict=True):
             if np.all(passed[k, j : j + SHELLS]):
                 one, radius = trials[k], float(every.largest[k] * 0.5**j)
-                largest, points = float(np.max(contraction[k, j : j + SHELLS])), SHELLS * len(one.sizes)
-                found[k] = Neighbourhood(one.centre, one.status, one.direction, one.norm, radius, largest, points)
+                largest, tried = float(np.max(contraction[k, j : j + SHELLS])), SHELLS * len(one.sizes)
+                found[k] = Neighbourhood(one.centre, one.status, one.direction, one.norm, radius, largest, tried)
 
 
 def _contraction(
     trials: CycleTrial,
     chosen: Int[np.ndarray, " c"],
-    one_in: int,
+    points: Int[np.ndarray, " p"],
     radius: Float[np.ndarray, " c"],
     events: Int[np.ndarray, "c 1"],
     returned: ReturnMap,
 ) -> Float[np.ndarray, " c"]:
-    """The largest ratio of norms after and before one period, of one in so many points on a shell of each of the chosen cycles;
-    NaN unless all come back in the cycle's contact mode after as many events as the cycle has.
+    """The largest ratio of norms after and before one period, of these points on a shell of each of the chosen cycles; NaN
+    unless all come back in the cycle's contact mode after as many events as the cycle has.
     """
-    if not len(chosen):
-        return radius
     own = CycleTrial(*(np.asarray(part)[chosen] for part in trials))
-    centre, sizes = own.centre[:, None], own.sizes[:, ::one_in]
-    images = returned(chosen, centre + radius[:, None, None] * own.steps[:, ::one_in])
+    centre, sizes = own.centre[:, None], own.sizes[:, points]
+    images = returned(chosen, centre + radius[:, None, None] * own.steps[:, points])
     away = (images.y - centre) @ np.swapaxes(own.norm, 1, 2)
     ratios = np.max(np.linalg.norm(away, axis=2) / (radius[:, None] * sizes), axis=1)
     mode = np.expand_dims(own.status, 1), np.expand_dims(own.direction, 1)

@@ -103,8 +103,10 @@ def groups_of(values: dict[str, np.ndarray], within: Collection[str]) -> tuple[n
 
 def constants_of(task: Task, distinct: np.ndarray) -> Flattened:
     """`GroupConstants` of each row of `distinct`, as one array."""
-    # So many groups are worked out at a time.
-    size, parts = 64, []
+    # So many groups are worked out at a time: NumPy takes as long for a few as for hundreds. Intermediate results of large
+    # structures take memory.
+    few, parts = 64, []
+    size = few if len(distinct) <= few else int(np.clip(2**16 // task.scene.structure.size**2, few, 512))
     for start in range(0, len(distinct), size):
         # Padded with copies, so that there is one size.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)

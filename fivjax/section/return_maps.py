@@ -146,9 +146,12 @@ class ReturnMaps:
 
     def in_contact(self, group, y: Float[np.ndarray, "m 2n"]) -> Section:
         """These deviations from sliding with the contact modes that their forces demand."""
-        own = jax.tree.map(lambda leaf: np.asarray(leaf)[group], self.shared[0])
-        contact = _contacts_demanded(own, np.asarray(y, float))
-        return Section(np.array(y, float), np.asarray(contact.status), np.asarray(contact.direction))
+        y = np.asarray(y, float)
+        # Of few sizes, each of which NumPy needs a plan for.
+        rows = np.minimum(np.arange(max(8, 1 << (len(y) - 1).bit_length())), len(y) - 1)
+        own = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(group)[rows]], self.shared[0])
+        contact = _contacts_demanded(own, y[rows])
+        return Section(y.copy(), *(np.asarray(part)[: len(y)] for part in (contact.status, contact.direction)))
 
     def moves(self, group, y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
         """Which of these deviations from sliding are of a motion that has not faded."""
@@ -164,14 +167,18 @@ class ReturnMaps:
         return jumped_to(y, self.weights, self.section, self.tangential)
 
     def free_directions(
-        self, status: int | Int[np.ndarray, " c"], y: Float[np.ndarray, " 2n"]
-    ) -> Float[np.ndarray, "2n f"]:
-        """The weighted directions that the section and a contact mode leave free at a state of the section, as columns."""
-        if np.ndim(status):
-            places = np.asarray(self.tangential), np.asarray(self.normal)
-            section = np.zeros_like(self.section) if self.jumped(y[None])[0] else self.section
-            return directions_of_several(self.weights, section, *places, status, self._without_slip(status, y))
-        return np.eye(len(self.weights))[:, self._free(np.atleast_1d(status), y[None])[0]]
+        self, status: Int[np.ndarray, "m *contacts"], y: Float[np.ndarray, "m 2n"]
+    ) -> list[Float[np.ndarray, "2n _"]]:
+        """The weighted directions that the section and a contact mode leave free at each of these states of the section, as
+        columns.
+        """
+        if np.ndim(self.normal) == 0:
+            every = np.eye(len(self.weights))
+            return [every[:, free] for free in self._free(status, y)]
+        places, without_slip = (np.asarray(self.tangential), np.asarray(self.normal)), self._without_slip(status, y)
+        sections = np.where(self.jumped(y)[:, None], 0.0, self.section)
+        each = zip(sections, status, without_slip, strict=True)
+        return [directions_of_several(self.weights, section, *places, *own) for section, *own in each]
 
     def _without_slip(self, status: Int[np.ndarray, "..."], y: Float[np.ndarray, "*m 2n"]) -> Bool[np.ndarray, "..."]:
         """Which contacts stick; or slide with the velocity of a belt, to the bit, because an impact has ended their slip."""
@@ -310,10 +317,7 @@ class ReturnMaps:
 
     def _directions(self, at: Section) -> tuple[Int[np.ndarray, " d"], Float[np.ndarray, "d 2n"]]:
         """The weighted directions that each state's contact mode and the section leave free, with the row of the state."""
-        if np.ndim(self.normal) == 0:
-            row, place = np.nonzero(self._free(at.status, at.y))
-            return row, np.eye(len(self.weights))[place]
-        each = [self.free_directions(status, y).T for status, y in zip(at.status, at.y, strict=True)]
+        each = [directions.T for directions in self.free_directions(at.status, at.y)]
         return np.repeat(np.arange(len(each)), list(map(len, each))), np.concatenate(each)
 
     def _exactly(self, program, size: int, group, at: Section, crossings):

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fivjax.attractors.neighbourhood import ReturnImages, adapted_norm, cycle_trial, neighbourhoods, side_by_side
+from fivjax.attractors.neighbourhood import ReturnImages, adapted_norms, cycle_trials, neighbourhoods, side_by_side
 from fivjax.contact import Status
 from fivjax.section.free_directions import zero_on_section
+from fivjax.section.return_maps import Section
 
 CENTRE = np.array([1.0, 0.5, 0.0, 0.0, 2.0, 0.0])
 WEIGHTS = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
@@ -34,8 +35,13 @@ def jacobian_of(matrix):
     return jacobian
 
 
+def trial_of(matrix):
+    at = Section(CENTRE[None], *(np.array([part]) for part in SLIDING))
+    return cycle_trials(at, jacobian_of(matrix)[None], WEIGHTS[None], [np.eye(6)[:, FREE]])[0]
+
+
 def found(matrix, returned):
-    attempt = cycle_trial(CENTRE, *SLIDING, jacobian_of(matrix), WEIGHTS, np.eye(6)[:, FREE])
+    attempt = trial_of(matrix)
     return None if attempt is None else neighbourhoods([attempt], returned)[0]
 
 
@@ -51,7 +57,7 @@ def test_the_norm_contracts_whatever_grows_before_it_decays(seed, largest, size)
     rng = np.random.default_rng(seed)
     matrix = np.triu(rng.normal(size=(size, size)), 1) * 10 + np.diag(largest * rng.uniform(-1, 1, size))
     matrix[0, 0] = largest
-    root, rate = adapted_norm(matrix)
+    (root,), (rate,) = adapted_norms(matrix[None])
     assert largest < rate < 1
     contracted = np.linalg.norm(root @ matrix @ np.linalg.inv(root), 2)
     assert contracted <= rate * (1 + 1e-6)
@@ -161,7 +167,7 @@ def test_several_cycles_are_checked_at_once_each_by_itself():
     bends, least = [0.0, 3.0, 300.0, 3.0, 40.0], [0.0, 0.0, 0.0, 1.0, 0.0]
     trials = []
     for derivative, share in zip(derivatives, least, strict=True):
-        one = cycle_trial(CENTRE, *SLIDING, jacobian_of(derivative), WEIGHTS, np.eye(6)[:, FREE])
+        one = trial_of(derivative)
         trials.append(one._replace(smallest=max(one.smallest, share * one.largest)))
 
     def map_of(k):
