@@ -117,7 +117,7 @@ def continue_cycle(
         own, lower, upper = apart(value, low, high)
         raise ValueError(
             f"Argument `bounds` must hold the scene's own {parameter}, {own}, but is ({lower}, {upper}). "
-            f"Widen it, or start elsewhere with `scene.replace`."
+            f"Widen it, or begin with a scene whose {parameter} lies between them."
         )
     arguments.whole_number("points", points, minimum=2)
     arguments.truth("derivatives", derivatives)

@@ -3,7 +3,7 @@
 import dataclasses
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -13,6 +13,9 @@ from .options import SceneOptions
 from .outputs import Overwrite, output_paths, write_data, write_picture
 from .parsing import axis, bound, low_pass, pair
 from .structure_options import StructureOptions
+
+if TYPE_CHECKING:
+    from ..model.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +32,7 @@ class Cea:
     def run(self) -> None:
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
         along = dict([axis(self.x, least=2)])  # with a single value there would be no lines to draw
+        self.scene.refuse_constant_friction(x=next(iter(along)))
         direction = 1 if self.scene.belt_speed >= 0 else -1
         if self.scene.structure is not None:
             self._of_file(along, direction, data, picture)
@@ -37,6 +41,7 @@ class Cea:
         dataset = fj.cea.modes(scene, **along)
         write_data(dataset, data)
         write_picture(fj.plot.linear.eigenvalues(dataset), picture)
+        _print_growth(scene)
         limit = fj.cea.stability_limit(scene.structure, direction=direction)
         if limit.outcome is fj.cea.StabilityOutcome.FOUND:
             print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
@@ -49,6 +54,7 @@ class Cea:
         if self.scene.load:
             scene = self.scene.scene()
             structure, dataset = scene.structure, fj.cea.modes(scene, **along)
+            _print_growth(scene)
         elif self.scene.mu_static is not None or set(along) != {"mu"}:
             raise ValueError(
                 "Option `--load` is missing: without it modes can be followed over constant friction only, `--x mu=…`."
@@ -61,6 +67,16 @@ class Cea:
         limit = fj.cea.stability_limit(structure, direction=direction)
         found = f" {float(limit.mu):.6g} at {float(limit.frequency):.2f} Hz" if limit.mu < float("inf") else ""
         print(f"  critical friction: {limit.outcome.value}{found}")
+
+
+def _print_growth(scene: "Scene") -> None:
+    """Whether steady sliding under falling friction is stable: that does not follow from the critical friction."""
+    if not scene.friction.constant:
+        growth = float(fj.cea.growth_rate(scene))
+        stable = "unstable" if growth > 0 else "stable"
+        print(
+            f"  growth rate of this scene {growth:.6g} 1/s, so steady sliding is {stable}; if friction were constant:"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

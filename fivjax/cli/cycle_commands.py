@@ -60,6 +60,7 @@ class Branch:
         import numpy as np
 
         name, bounds = bound(self.over)
+        self.scene.refuse_constant_friction(over=name)
         other, values = (None, [None]) if self.each is None else axis(self.each)
         endings = [".nc"] if other is None else [f"-{k + 1}.nc" for k in range(len(values))]
         endings += [] if self.map is None else ["-map.nc"]

@@ -83,6 +83,7 @@ class Map:
         axes = dict(map(axis, (self.x, self.y)))
         if len(axes) != 2:
             raise ValueError(f"A map needs two different parameters, but --x and --y are both {next(iter(axes))}.")
+        self.scene.refuse_constant_friction(**dict(zip(("x", "y"), axes, strict=True)))
         if self.scene.belt_speed == 0 and "belt_speed" not in axes:
             raise ValueError(
                 "Option `--belt-speed` must not be zero: a map starts from steady sliding, which a belt at rest does not have."

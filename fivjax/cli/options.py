@@ -82,6 +82,18 @@ class SceneOptions:
             )
         return fj.ExponentialDecay(self.mu_static, self.mu_dynamic, decay if self.decay is None else self.decay)
 
+    def refuse_constant_friction(self, **names: str) -> None:
+        """Refuse the parameter `mu` for these options, which have it unless told otherwise, where friction falls with speed.
+
+        **Raises:** `ValueError` for it.
+        """
+        for option, name in names.items():
+            if name == "mu" and self.mu_static is not None:
+                raise ValueError(
+                    f"Option `--{option}` must name another parameter than `mu`: friction by --mu-static has "
+                    f"mu_static, mu_dynamic and decay, and a scene also has belt_speed and others."
+                )
+
 
 @dataclasses.dataclass(frozen=True)
 class MethodOptions:

@@ -64,7 +64,7 @@ def _array(leaf) -> ArrayForm | None:
         return ArrayForm(leaf.shape, _name_of(leaf.dtype))
     if isinstance(leaf, float):
         return _NUMBER
-    if isinstance(leaf, jax.Array | np.generic):
+    if isinstance(leaf, jax.Array | np.number | np.bool):
         return ArrayForm(leaf.shape, _name_of(np.dtype(leaf.dtype)))
     return None
 

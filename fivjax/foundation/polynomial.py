@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 
 def value_and_slope(c: Sequence[Array] | Array, x: Array) -> tuple[Array, Array]:
@@ -49,6 +49,26 @@ def extremum(c: Sequence[Array] | Array, x: Array, low: Array | float, high: Arr
 
     # A loop, because its body is compiled once.
     return jax.lax.fori_loop(0, steps, nearer, x)
+
+
+@jax.custom_jvp
+def moving_root(c: Float[Array, "k g"], x: Float[Array, ""], chosen: Bool[Array, " g"]) -> Float[Array, ""]:
+    """x, which is a root of the chosen one of these polynomials, with the derivatives of an implicit function, of any order; if
+    none is chosen, it stays.
+    """
+    del c, chosen
+    return x
+
+
+@moving_root.defjvp
+def _(primals, tangents):
+    c, _, chosen = primals
+    # With its own derivative, so that further ones are right as well.
+    x = moving_root(*primals)
+    value, _ = value_and_slope(tangents[0], x)
+    _, slope = value_and_slope(c, x)
+    value, slope = (jnp.sum(jnp.where(chosen, part, 0.0)) for part in (value, slope))
+    return x, -value / jnp.where(slope == 0, 1.0, slope)
 
 
 def _with_derivatives(c: Sequence[Array] | Array, x: Array, count: int) -> list[Array]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..contact import Mechanics
-from ..foundation.polynomial import extremum, in_shares, value_and_slope
+from ..foundation.polynomial import extremum, in_shares, moving_root, value_and_slope
 
 # Samples of the tangential speed in a segment; Newton's method finds the peak from the largest.
 SAMPLES = 24
@@ -40,8 +40,7 @@ def peak_of_series(
     speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""], before: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The largest speed of a series up to its end, or `before` if that is larger."""
-    # To first order the value at a peak does not depend on its instant; but at the advance's end, where an event ends it or the
-    # slope jumps, the instant is the event's.
+    # At the advance's end, where an event ends it or the slope jumps, a peak's instant is the event's.
     until = jax.lax.stop_gradient(end)
     shares = np.linspace(0.0, 1.0, SAMPLES)
     k = np.arange(len(speeds))
@@ -57,7 +56,10 @@ def peak_of_series(
         largest = jnp.max(jnp.where(sizes == highest, samples, 0.0))
         x = jax.lax.stop_gradient(extremum(speeds, largest, 0.0, until, PEAK_STEPS))
         # Where Newton's method leads to a lower one, the sample counts.
-        x = jnp.where(jnp.abs(value_and_slope(speeds, x)[0]) >= highest, x, largest)
+        higher = jnp.abs(value_and_slope(speeds, x)[0]) >= highest
+        # The value's first derivative does not depend on how the instant moves; the second does.
+        slopes = (k[1:] * speeds[1:])[:, None]
+        x = jnp.where(higher, moving_root(slopes, x, (higher & (x > 0) & (x < until))[None]), largest)
         peak, _ = value_and_slope(speeds, jnp.where(x >= until, end, x))
         return jnp.maximum(before, jnp.where(h > 0, jnp.abs(peak), 0.0))
 

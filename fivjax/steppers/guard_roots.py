@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from .. import contact as physics
 from ..contact import Mechanics
 from ..contact.rounding import zero_at_start
-from ..foundation.polynomial import ratio, value_and_slope, value_slope_and_bend
+from ..foundation.polynomial import moving_root, ratio, value_and_slope, value_slope_and_bend
 
 MOST_ROOT_STEPS = 60
 # A guard that starts further below zero, in shares of its size, has been put there by a jump: of the load, or of the forces of
@@ -168,22 +168,4 @@ def implicit_root(
     least = jnp.sum(jnp.where(chosen, scaled[0], 0.0))
     rounding = JUMPED * max(tolerance, float(jnp.finfo(scaled.dtype).eps)) * size
     jumped = jax.lax.stop_gradient((x == 0) & (least < -rounding))
-    return _moving_root(scaled, jax.lax.stop_gradient(x), jnp.where(jumped, False, chosen))
-
-
-@jax.custom_jvp
-def _moving_root(c: Float[Array, "k g"], x: Float[Array, ""], chosen: Bool[Array, " g"]) -> Float[Array, ""]:
-    """x, which is a root of the chosen polynomial; if none is chosen, it stays."""
-    del c, chosen
-    return x
-
-
-@_moving_root.defjvp
-def _(primals, tangents):
-    c, _, chosen = primals
-    # With its own derivative, so that further ones are right as well.
-    x = _moving_root(*primals)
-    value, _ = value_and_slope(tangents[0], x)
-    _, slope = value_and_slope(c, x)
-    value, slope = (jnp.sum(jnp.where(chosen, part, 0.0)) for part in (value, slope))
-    return x, -value / jnp.where(slope == 0, 1.0, slope)
+    return moving_root(scaled, jax.lax.stop_gradient(x), jnp.where(jumped, False, chosen))

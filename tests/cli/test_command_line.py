@@ -138,6 +138,20 @@ def test_an_interrupt_after_the_data_says_that_they_are_there(monkeypatch, tmp_p
     assert (tmp_path / "run.nc").exists()
 
 
+def test_cea_of_falling_friction_says_whether_this_scene_slides(tmp_path, capsys):
+    """At 1.1 m/s its friction is below the critical one of constant friction, and yet sliding is unstable."""
+    falling, out = ["--mu-static", "0.3", "--mu-dynamic", "0.12"], ["--out", str(tmp_path / "out")]
+    assert main(["cea", *falling, "--belt-speed", "1.1", "--x", "belt_speed=1:1.1:2", *out]) == 0
+    growth = fj.cea.growth_rate(
+        fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.3, 0.12), 1.1, fj.ConstantLoad(100.0))
+    )
+    said = capsys.readouterr().out
+    assert (
+        f"growth rate of this scene {growth:.6g} 1/s, so steady sliding is unstable; if friction were constant:" in said
+    )
+    assert said.index("if friction were constant") < said.index("critical friction")
+
+
 def test_a_branch_that_cannot_begin_costs_none_that_is_done(monkeypatch, tmp_path, capsys):
     """Values that look alike in six digits are told apart."""
 

@@ -127,6 +127,11 @@ def test_calibrate(folder, capsys, arguments, fragments):
         (["tradeoff", "--mu", "200"], ["Painlevé", "200"]),
         (["reproduce", "--figure", "19"], ["`figure`", "'19'"]),
         (["reproduce", "--figure", "1"], ["drawing"]),
+        *(
+            ([command, "--mu-static", "0.3", "--mu-dynamic", "0.2"], [option, "`mu`", "mu_static"])
+            for command, option in (("cea", "--x"), ("map", "--x"), ("branch", "--over"))
+        ),
+        (["branch", "--over", "mu=0.2:0.22"], ["`bounds`", "0.227", "a scene whose mu lies between them"]),
         (["cea", "--x", "mu"], ["NAME=FROM:TO:COUNT", "'mu'"]),
         (["cea", "--x", "speed=1:2:3"], ["`speed`"]),
         (["cea", "--x", "mu=-1:2:3"], ["`mu`", "-1"]),

@@ -53,6 +53,22 @@ def test_reverse_derivatives_of_a_batch_are_those_of_neighbouring_cycles(cycle):
             assert slopes[name][k] == pytest.approx((above - below) / (2 * own), rel=1e-6)
 
 
+@pytest.mark.parametrize("name", ["mu", "belt_speed"])
+def test_second_derivatives_are_differences_of_first_ones(cycle, name):
+    """Of the amplitude, too, though its first derivative knows nothing of how the fastest instant moves."""
+    values = float(SCENE.parameters[name]) + 1e-5 * np.arange(-1, 2)
+
+    def found(value):
+        near = fj.nearby_cycle(SCENE.replace(**{name: value}), cycle)
+        return jnp.stack([near.amplitude, near.period])
+
+    with jax.enable_x64(True):
+        slope = compiled(lambda value: jax.jvp(found, (value,), (jnp.ones_like(value),))[1])
+        bend = compiled(lambda value: jax.jvp(slope, (value,), (jnp.ones_like(value),))[1])
+        before, _, after = (slope(jnp.asarray(value)) for value in values)
+        np.testing.assert_allclose(bend(jnp.asarray(values[1])), (after - before) / 2e-5, rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_over_many_small_stages_it_comes_far(cycle):
     """To a cycle that a search from nothing finds, through a quarter of the belt's speed."""

@@ -49,6 +49,11 @@ def test_the_hundred_and_first_call_gives_what_the_first_gives():
             assert array.tolist() == [2.0, 2.0 * k] and number == 2.0
 
 
+def test_names_may_be_strings_of_numpy():
+    known = by_numpy(lambda names, x: len(names) * x)
+    assert known((np.str_("mu"), np.array(["k1"])[0]), 3.0) == known(("mu", "k1"), 3.0) == 6.0
+
+
 def test_a_singular_system_has_no_finite_solution():
     with jax.enable_x64(True):
         assert not np.all(np.isfinite(by_numpy(solve)(np.ones((2, 2)), np.array([1.0, 2.0]))))
