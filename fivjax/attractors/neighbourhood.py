@@ -193,7 +193,8 @@ def neighbourhoods(trials: list[CycleTrial], returned: ReturnMap) -> list[Neighb
             passed[rows, shell], stage[rows, shell] = ratios <= every.allowed[rows], now + 1
 
     # First those of which one passes mostly, at once.
-    check(*np.nonzero(passed[:, :12]), 0)
+    rows, shell = np.nonzero(passed[:, :12])
+    check(rows, shell, 0)
     while True:
         runs = np.all(np.lib.stride_tricks.sliding_window_view(passed, SHELLS, axis=1), axis=2)
         left = np.flatnonzero(np.any(runs, axis=1) & np.array([one is None for one in found]))
