@@ -88,7 +88,7 @@ class SceneOptions:
         **Raises:** `ValueError` for it.
         """
         for option, name in names.items():
-            if name == "mu" and self.mu_static is not None:
+            if name == "mu" and None not in (self.mu_static, self.mu_dynamic):
                 raise ValueError(
                     f"Option `--{option}` must name another parameter than `mu`: friction by --mu-static has "
                     f"mu_static, mu_dynamic and decay, and a scene also has belt_speed and others."
