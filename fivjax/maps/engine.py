@@ -124,7 +124,7 @@ class _Run(NamedTuple):
         keys = {row.tobytes() for row in (*groups, *np.unique(seeding, axis=0))}
         known = {key: self.attractors[key] for key in keys & self.attractors.keys()}
         file = (None, "") if self.options.keeper is None else self.options.keeper.job_file(own)
-        return Job(task, values, seeding, known, *file)
+        return Job(task, values, seeding, known, task.by_kernel, *file)
 
     def write(self, number: int, results: Verdicts) -> None:
         for whole, own in zip(jax.tree.leaves(self.verdicts), jax.tree.leaves(results), strict=True):

@@ -6,6 +6,7 @@ job alone, not from the worker or from other jobs. A map keeps the results of wh
 its missing jobs; one that was under way goes on from its own file (`job_files`).
 """
 
+import platform
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import NamedTuple
@@ -38,6 +39,7 @@ class Job(NamedTuple):
     values: dict[str, np.ndarray]
     seeding: Float[np.ndarray, "r k"]  # see `Grid.seeding`
     known: dict[bytes, Attractors]
+    by_kernel: bool  # whether kernels follow the trajectories where the map was begun
     file: str | None = None  # where it keeps how far it has come,
     key: str = ""  # and what the file calls this job of this run
 
@@ -60,7 +62,16 @@ def run_job(
 
     It may use `threads` of the process it runs in. `report` gets the number of trajectories that have ended and may stop the
     job by an exception; `interrupted` then gets the verdicts known by then, and the job's file what it takes to go on.
+
+    **Raises:** `RuntimeError` in a worker that steps by other means than the process where the map was begun: results would
+    depend on who computed them, by rounding.
     """
+    if job.by_kernel != job.task.by_kernel:
+        raise RuntimeError(
+            f"Trajectories of this map are followed {'by kernels' if job.by_kernel else 'without kernels'} where it was begun, "
+            f"but this worker, on {platform.node()}, {'has none' if job.by_kernel else 'has them'}. Install the same versions "
+            f"of jax and warp-lang for both."
+        )
     if threads is None:
         # Also in a pool that a user has made: its workers would wait for jobs of a killed process for ever.
         end_with_parent()

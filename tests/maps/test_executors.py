@@ -128,6 +128,22 @@ def test_what_a_job_raises_ends_the_run():
             hand_out([0], lambda n: workers.submit(lambda: 1 / n), workers, print, print, lambda: False)
 
 
+def test_a_worker_without_the_kernels_of_the_others_is_refused(paper_scene):
+    """It would compute by XLA, forty times as slowly, and rounded otherwise."""
+
+    class Elsewhere(ThreadPoolExecutor):
+        def submit(self, function, *args):
+            def there():
+                with pytest.MonkeyPatch.context() as patch:
+                    patch.setattr("fivjax.maps.groups.has_kernel", lambda *_, **__: False)
+                    return function(*args)
+
+            return super().submit(there)
+
+    with Elsewhere(1) as pool, pytest.raises(RuntimeError, match=r"followed by kernels .* has none\. Install"):
+        fj.bistability_map(paper_scene, p=[1.0, 2.0], executor=pool, progress=False)
+
+
 @pytest.mark.parametrize(
     ("executor", "error", "fragment"),
     [
