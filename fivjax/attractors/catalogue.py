@@ -4,7 +4,7 @@ motions each has captured.
 Cycles are computed (`cycles`); what motions trace that no cycle captures is tried as a torus (`tori`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -90,6 +90,7 @@ class Catalogue(NamedTuple):
                 added.append((g, cycle))
         if self.from_afar:
             self._add_approaches(added)
+        self._keep_apart(g for g, _ in added)
 
     def add_approaches(self, groups: list[int]) -> None:
         """Adds the approaches to those cycles of many crossings of these groups that have none."""
@@ -103,6 +104,7 @@ class Catalogue(NamedTuple):
                 if len(cycle.points) > CROSSINGS and not any(cycle is one for one in have)
             ]
         )
+        self._keep_apart(groups)
 
     def _add_approaches(self, to: list[tuple[int, StableCycle]]) -> None:
         if not to:
@@ -111,7 +113,9 @@ class Catalogue(NamedTuple):
         for g, one in zip(groups.tolist(), approaches(self.maps, groups, [c for _, c in to], self.report), strict=True):
             if one is not None:
                 self.of_group[g].approaches.append(one)
-        for g in np.unique(groups).tolist():
+
+    def _keep_apart(self, groups: Iterable[int]) -> None:
+        for g in set(groups):
             self.of_group[g].keep_apart(self.maps)
 
     def add_tori(self, motions: Motions, tubes=TUBES[:1]) -> None:
@@ -126,6 +130,7 @@ class Catalogue(NamedTuple):
             if one is not None:
                 # What the tube captures comes to the cycle in the end.
                 known[row].approaches.append(Approach(known[row].with_cycle(self.maps, cycle), one))
+        self._keep_apart(motions.group.tolist())
 
     def add_tori_by_turns(self, motions: Motions, usable: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
         """The same from the usable motions, one of each group after the other, while there are some that none of the known

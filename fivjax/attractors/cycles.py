@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from ..contact import Status
 from ..section.return_maps import ReturnMaps, Section
 from .closing import Closed, close
-from .motions import Motions
+from .motions import Motions, position_of
 from .neighbourhood import LARGEST, CycleTrial, Neighbourhood, ReturnImages, cycle_trials, neighbourhoods, side_by_side
 
 # Crossings of the section in one period: of cycles that are sought first; of those on a torus that is locked to them; and of
@@ -68,6 +68,11 @@ class StableCycle(NamedTuple):
     def contraction(self) -> float:
         """The largest factor by which distances in the neighbourhood change in one period."""
         return self.neighbourhood.contraction
+
+    @property
+    def position(self) -> float:
+        """See `position_of`."""
+        return position_of(self.points)
 
 
 def stable_cycles(

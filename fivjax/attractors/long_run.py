@@ -62,14 +62,16 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
         left[rows] = False
         captured = catalogue.captures(Motions(group, at).rows(rows), np.ones(len(rows), bool))
         found.attractor.update((int(rows[row]), one) for row, one in captured.items())
+        arrived = [rows[list(captured)]]
         rows = np.delete(rows, list(captured))
         if len(rows):
             slow = _slow_fates(catalogue, Motions(group, at).rows(rows), onward[rows], slides)
             found.put(rows, slow)
-            # Where none of these comes to anything, neither do others that go on.
             ended = slow.chaotic | slow.without_events
             ended[list(slow.attractor)] = True
-            onward &= np.isin(group, group[rows[ended]])
+            arrived.append(rows[ended])
+        # Where none of these comes to anything, neither do others that go on.
+        onward &= np.isin(group, group[np.concatenate(arrived)])
     return found
 
 

@@ -48,3 +48,11 @@ def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*st
     x = (np.arange(len(values)) + 0.5) / len(values)
     weights = np.exp(-1.0 / (x * (1 - x)))
     return np.tensordot(weights / np.sum(weights), values, axes=1)
+
+
+def position_of(points: Float[np.ndarray, "k state"]) -> float:
+    """A number by which attractors of the same amplitude and period are told apart: how far the mean of the points lies along a
+    fixed direction, in units of their size. No exchange of coordinates leaves the direction as it is.
+    """
+    direction = np.cos(np.arange(points.shape[1]))
+    return float(np.mean(points, axis=0) @ direction / np.mean(np.linalg.norm(points, axis=1)))

@@ -27,7 +27,7 @@ from .cycles import (
 )
 from .divergence import diverges_along, growth_rates
 from .locked_tori import cycles_closed_in_on, cycles_repeated
-from .motions import NOMINATED, Motions, extent, smooth_mean
+from .motions import NOMINATED, Motions, extent, position_of, smooth_mean
 from .returning import BACK_TO, starts_on_edges, tubes_returned_to
 from .tube import Tube, thin, tree_of
 
@@ -70,6 +70,11 @@ class Torus(NamedTuple):
     def contraction(self) -> float:
         """The share of the tube to which everything came back that started on its edge."""
         return BACK_TO
+
+    @property
+    def position(self) -> float:
+        """See `position_of`."""
+        return position_of(self.tube.states)
 
 
 def tori_from(

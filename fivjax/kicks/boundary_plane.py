@@ -87,11 +87,12 @@ def boundary_section(
     right, left = _directions(saddle, weights)
     origin = weights * np.asarray(saddle.closed.point.y)
     axis, size = np.linspace(-reach, reach, points), np.linalg.norm(origin)
-    rest = np.asarray(sliding_state(scene, scene.load.final))
+    rest, attractors = np.asarray(sliding_state(scene, scene.load.final)), {}
 
     def verdicts(stable: np.ndarray, unstable: np.ndarray) -> np.ndarray:
         places = unstable.reshape(-1, 1) * right[0] + stable.reshape(-1, 1) * right[1]
-        return verdicts_from(scene, (origin + size * places) / weights + rest, "section").reshape(stable.shape)
+        states = (origin + size * places) / weights + rest
+        return verdicts_from(scene, states, "section", attractors).reshape(stable.shape)
 
     stable, unstable = np.meshgrid(axis, axis, indexing="ij")
     verdict = verdicts(stable, unstable)

@@ -57,8 +57,8 @@ def critical_perturbation(
         fj.critical_perturbation(scene, mu=np.linspace(0.05, 0.228, 40))          # Fig. 10
         fj.critical_perturbation(scene, belt_speed=[0.5, 1, 1.5, 3, 5, 10, 100])  # Table 2
 
-    The range of p is scanned in steps of `p_step`, then the first change from sliding to limit cycle is narrowed down. The
-    boundary may have islands (sliding above a limit cycle); those narrower than the steps are missed.
+    The range of p is scanned in steps of `p_step` or less, then the first change from sliding to limit cycle is narrowed down.
+    The boundary may have islands (sliding above a limit cycle); those narrower than the steps are missed.
 
     **Arguments:**
 

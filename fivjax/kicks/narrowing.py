@@ -32,7 +32,8 @@ def checked_range(p_range, p_step: float | None) -> tuple[float, float, float, i
     if p_step is None:
         p_step = min(P_STEP, float(high) - float(low))
     arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
-    return low, high, p_step, round(min((high - low) / p_step, 1e15)) + 1
+    # The last step is no longer than the others; by rounding alone there is none more.
+    return low, high, p_step, math.ceil(min((high - low) / p_step, 1e15) * (1 - 1e-6)) + 1
 
 
 class Kicked(NamedTuple):

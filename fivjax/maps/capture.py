@@ -4,6 +4,7 @@ Most attractors are found by the search (`attractors.search`); others from where
 have used up their time (`attractors.long_run`).
 """
 
+from collections import defaultdict
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -196,13 +197,16 @@ def later(
 def attractor_columns(count: int, attractor: dict[int, CapturingSet], chaotic: np.ndarray) -> dict[str, np.ndarray]:
     """What results say of the attractor of each of so many trajectories, by their names of it."""
     kind = np.where(chaotic, CHAOTIC, NO_ATTRACTOR).astype(np.int8)
-    told = ("amplitude", "period", "reach", "contraction", "multiplier")
+    told = ("amplitude", "period", "reach", "contraction", "multiplier", "position")
     numbers = dict(zip(told, np.full((len(told), count), np.nan), strict=True))
+    captors, rows_of = {id(captor): captor for captor in attractor.values()}, defaultdict(list)
     for row, captor in attractor.items():
-        one = captor.cycle if isinstance(captor, Approach) else captor
-        kind[row] = APPROACHED if one is not captor else TORUS if isinstance(one, Torus) else PERIODIC
+        rows_of[id(captor)].append(row)
+    for key, captor in captors.items():
+        one, rows = captor.cycle if isinstance(captor, Approach) else captor, rows_of[key]
+        kind[rows] = APPROACHED if one is not captor else TORUS if isinstance(one, Torus) else PERIODIC
         for name in told:
-            numbers[name][row] = getattr(one, name, np.nan)
+            numbers[name][rows] = getattr(one, name, np.nan)
     return {
         "amplitude": numbers.pop("amplitude"),
         **{f"attractor_{k}": v for k, v in {"kind": kind, **numbers}.items()},

@@ -144,8 +144,8 @@ def attractor_table(
 ) -> tuple[Int[np.ndarray, " trajectories"], dict[str, np.ndarray]]:
     """The index of each trajectory's attractor in the table (-1 without one), and the table's columns by name.
 
-    Attractors are in the order of their groups, and by amplitude within a group. `groups` gives the group of each trajectory
-    from its index.
+    Attractors are in the order of their groups, and by kind and amplitude within a group. `groups` gives the group of each
+    trajectory from its index.
     """
     on_one = np.flatnonzero(verdicts.verdict == Verdict.LIMIT_CYCLE)
     kind = np.where(verdicts.attractor_kind == APPROACHED, PERIODIC, verdicts.attractor_kind)
@@ -155,21 +155,19 @@ def attractor_table(
     place, first = np.full(len(verdicts.verdict), -1, np.int32), [on_one[:0]]
     for part in _whole_groups(group):
         rows = on_one[part]
-        columns = np.stack(
-            [
-                group[part],
-                verdicts.amplitude[rows],
-                verdicts.attractor_period[rows],
-                kind[rows],
-            ]
+        amplitude, period = verdicts.amplitude[rows], verdicts.attractor_period[rows]
+        # Those of the same cycle, computed from different guesses, agree to this error.
+        error = 1e-6
+        which = _told_apart(
+            (group[part], 0.0),
+            (kind[rows], 0.0),
+            (amplitude, error * amplitude),
+            (period, error * period),
+            # A symmetric structure has cycles in pairs, of one amplitude and one period.
+            (verdicts.attractor_position[rows], error),
         )
-        order = np.lexsort((columns[2], columns[1], columns[3], columns[0]))
-        rows, columns = rows[order], columns[:, order]
-        # Amplitudes and periods of the same cycle, computed from different guesses, agree to this relative error.
-        allowed = 1e-6 * np.array([0.0, 1.0, 1.0, 0.0])[:, None] * np.abs(columns[:, 1:])
-        new = np.append(True, np.any(np.abs(np.diff(columns, axis=1)) > allowed, axis=0))
-        place[rows] = sum(map(len, first)) + np.cumsum(new) - 1
-        first.append(rows[new])
+        place[rows] = sum(map(len, first)) + which
+        first.append(rows[np.unique(which, return_index=True)[1]])
     chosen = np.concatenate(first)
     return place, {
         "attractor_amplitude": verdicts.amplitude[chosen],
@@ -179,6 +177,18 @@ def attractor_table(
         "attractor_reach": verdicts.attractor_reach[chosen],
         "attractor_contraction": verdicts.attractor_contraction[chosen],
     }
+
+
+def _told_apart(*columns: tuple[np.ndarray, np.ndarray | float]) -> Int[np.ndarray, " r"]:
+    """The place of each row in the order of these columns, of which the first counts most. Rows are the same where they differ
+    in each column by no more than is allowed there, or by as little from others that are the same.
+    """
+    place = np.zeros(len(columns[0][0]), int)
+    for values, allowed in columns:
+        order = np.lexsort((values, place))
+        apart = np.diff(values[order]) > np.broadcast_to(allowed, len(values))[order][1:]
+        place[order] = np.cumsum(np.append(False, apart | (np.diff(place[order]) > 0)))
+    return place
 
 
 def _whole_groups(group: Int[np.ndarray, " r"]) -> Iterator[slice]:

@@ -23,6 +23,7 @@ class Verdicts(NamedTuple):
     attractor_multiplier: np.ndarray  # size of the largest
     attractor_reach: np.ndarray  # of the neighbourhood that it draws in, relative to its size
     attractor_contraction: np.ndarray  # the factor by which that shrinks
+    attractor_position: np.ndarray  # see `attractors.motions.position_of`
     bound: np.ndarray  # on the share of the margins of sliding that can still be used up; NaN but for those that slide
     decided_at: np.ndarray  # s
     events: np.ndarray

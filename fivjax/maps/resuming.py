@@ -18,6 +18,7 @@ from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
 from .groups import bytes_per_trajectory, kernels_by
 from .plan import Grid, largest_job_size, takes_long
+from .results import by_name, not_run
 from .store import Store, is_store
 
 
@@ -55,6 +56,7 @@ def keeper_at(
         "method": re.sub(r" at 0x[0-9a-f]+", "", repr(method)),
         "code": code_of(scene) | _code_of_method(method, scene),
         **limits,
+        "results": [*by_name(not_run(0, energy))],
         "axes": {name: values.tolist() for name, values in grid.axes.items()},
     }
     if not is_store(path):

@@ -59,5 +59,7 @@ class RunLock:
 
     def remove(self) -> None:
         """Let others write, and leave no file."""
-        self._path.unlink(missing_ok=True)
+        # Where it has been removed with its folder, another process may have made one of its own by now.
+        if self._file is not None and self._is_there():
+            self._path.unlink(missing_ok=True)
         self.release()

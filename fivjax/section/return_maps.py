@@ -198,7 +198,7 @@ class ReturnMaps:
 
     def returns(self, group, at: Section, crossings, kept: int = 1, peaks: bool = False) -> Images:
         """The `crossings`-th crossing from each row, with the last `kept` states on the section, and with the largest speed if
-        `peaks` are asked for. More than `KEPT` states are kept only if they are all of them.
+        `peaks` are asked for. More than `KEPT` states are kept only where all rows have as many crossings.
         """
         if not len(group):
             # Blocks are never empty.
@@ -208,6 +208,9 @@ class ReturnMaps:
         if self.kernels is not None or kept <= KEPT:
             return self._returns(group, at, crossings, kept, peaks)
         parts: list[Images] = []
+        if (before := int(np.max(crossings)) - kept) > 0:
+            first = self._returns(group, at, before, 1, peaks)
+            parts.append(first._replace(path=first.path[:, :0]))
         for start in range(0, kept, KEPT):
             part = min(KEPT, kept - start)
             parts.append(self._returns(group, parts[-1].at if parts else at, part, part, peaks))

@@ -84,6 +84,22 @@ def test_an_approach_with_another_cycle_in_it_is_left_out():
         assert len(known.approaches) == kept
 
 
+def test_a_cycle_found_later_in_the_tube_of_a_locked_torus_ends_what_that_captures(monkeypatch):
+    maps, cycle = Line(0.5), cycle_of(0.5)
+    (found,) = approaches(maps, np.zeros(1, int), [cycle], lambda count: None)  # type: ignore[arg-type]
+    assert found is not None
+    known = Attractors.none()
+    of_group, motions = Catalogue(maps, {0: known}, lambda count: None), Motions(np.zeros(1, int), None)  # type: ignore
+    # A torus about which everything comes back, and that is locked to the cycle.
+    monkeypatch.setattr(catalogue, "tori_from", lambda *_: ({}, [(0, cycle, found.tube)]))
+    of_group.add_tori(motions)
+    assert [one.cycle for one in known.approaches] == [cycle]
+    other = cycle._replace(points=cycle.points - np.array([0.05, 0.0, 0.0, 0.0]))
+    monkeypatch.setattr(catalogue, "stable_cycles", lambda *_: [(0, np.zeros(1, int), other)])
+    of_group.add_cycles(motions)
+    assert known.cycles == [cycle, other] and not known.approaches
+
+
 def test_a_map_by_approaches_says_what_it_says_by_neighbourhoods_alone(monkeypatch):
     """Every verdict and every amplitude, of cycles on locked tori; in less time of the motion."""
     axes = {"mu": np.array([0.165, 0.28]), "p": np.linspace(1.5, 3.0, 32)}

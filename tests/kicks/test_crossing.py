@@ -16,6 +16,21 @@ KICKS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
 
 
 @pytest.mark.parametrize(
+    ("p_range", "p_step", "kicks"),
+    [
+        ((1.0, 1.149), 0.1, 3),
+        ((1.0, 1.2), 0.1, 3),
+        ((1.0, 5.0), 0.01, 401),
+        ((1.2 - 1e-4, 1.2 + 1e-4), 1e-4, 3),
+        ((1, 2), 1, 2),
+    ],
+)
+def test_the_steps_of_a_scan_are_no_longer_than_asked(p_range, p_step, kicks):
+    low, high, _, count = narrowing.checked_range(p_range, p_step)
+    assert count == kicks and (high - low) / (count - 1) <= p_step * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
     ("row", "low", "high", "middle", "changes"),
     [
         ([0, 0, 0, 1, 1, 1], 1.2, 1.3, 1.25, 1),

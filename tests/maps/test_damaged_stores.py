@@ -1,6 +1,7 @@
 """Single bits flipped in what a map has kept: never a wrong result, never an error without a sentence."""
 
 import random
+import shutil
 import warnings
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import fivjax as fj
 from fivjax.maps import engine, job_files, plan, store
 from fivjax.maps.checkpoint import BLOCK, Checkpoint
 from fivjax.maps.results import not_run
-from fivjax.maps.run_lock import LOCK
+from fivjax.maps.run_lock import LOCK, RunLock
 from tests.helpers import stand_in_jobs
 
 AXES = {"mu": np.linspace(0.1, 0.2, 3), "p": np.linspace(1.0, 3.0, 4)}
@@ -130,3 +131,19 @@ def test_a_damaged_job_file_is_not_used(tmp_path):
     path.write_bytes(b"anything at all")
     with pytest.warns(UserWarning, match="of an unfinished job is damaged"):
         assert job_files.JobFile(str(path), "key").last() is None
+
+
+def test_who_releases_a_lock_leaves_that_of_another_alone(tmp_path):
+    """The folder of a run that is over is removed; then somebody else begins one."""
+    jobs = tmp_path / "jobs"
+    jobs.mkdir()
+    lock = RunLock(jobs, "the first")
+    shutil.rmtree(jobs)
+    jobs.mkdir()
+    other = RunLock(jobs, "the second")
+    lock.remove()
+    assert (jobs / LOCK).exists()
+    with pytest.raises(ValueError, match="The third is being written by another process"):
+        RunLock(jobs, "The third")
+    other.remove()
+    assert not (jobs / LOCK).exists()

@@ -204,6 +204,36 @@ def test_where_the_first_come_to_nothing_the_others_are_not_followed_onward(monk
     assert found.chaotic.tolist() == [True] * 4 + [False] * 4
 
 
+def test_where_the_first_are_captured_at_once_the_others_are_followed_onward_whoever_is_in_the_job(monkeypatch):
+    """In one group the first motions are where something captures them; in the other they are still undecided."""
+    asked = []
+
+    def slow_fates(catalogue, motions, onward, slides):
+        asked.append((motions.group.tolist(), onward.tolist()))
+        nothing = np.zeros(len(motions.group), int)
+        return Fates(nothing > 0, {}, nothing > 0, motions.at, 0.0 * nothing, nothing)
+
+    def captures(self, motions, rows, latest=None):
+        return {int(row): "something" for row in np.flatnonzero(rows & (np.abs(motions.at.y[:, 0] - 1.5) > 0.15))}
+
+    monkeypatch.setattr(long_run, "_slow_fates", slow_fates)
+    monkeypatch.setattr(Catalogue, "captures", captures)
+    y = np.stack([[1.1, 1.5, 1.9, 1.4, 1.5, 1.6], *np.zeros((3, 6))], axis=1)
+    at = Section(y, np.ones(6, np.int32), np.ones(6))
+    catalogue = Catalogue(Line(), {g: Attractors.none() for g in range(2)}, lambda _: None)  # type: ignore[arg-type]
+    for group, calls in (
+        ([0, 0, 0], [([0], [True])]),
+        ([0, 0, 0, 1, 1, 1], [([1, 1], [True, True]), ([0, 1], [True, False])]),
+    ):
+        asked.clear()
+        fates(catalogue, Motions(np.array(group), at.rows(slice(len(group)))))
+        assert asked == calls
+    # One of the first is captured.
+    asked.clear()
+    fates(catalogue, Motions(np.zeros(4, int), at.rows(np.array([4, 0, 5, 3]))))
+    assert asked == [([0], [True]), ([0, 0], [True, True])]
+
+
 def test_what_comes_from_a_torus_nearby_to_a_known_cycle_is_not_asked_for_a_torus(monkeypatch):
     """A group whose neighbour has the cycle and a torus: the motion from the torus ends on the cycle."""
     known = {g: Attractors.none() for g in range(2)}

@@ -12,7 +12,7 @@ from fivjax.maps.groups import Task, constants_of
 from fivjax.section.about_sliding import sliding_state
 from fivjax.section.by_kernel import section_kernels
 from fivjax.section.free_directions import directions_of_several, zero_on_section
-from fivjax.section.return_maps import ReturnMaps, Section, section_at
+from fivjax.section.return_maps import KEPT, Images, ReturnMaps, Section, section_at
 
 CROSSINGS = 6
 
@@ -143,3 +143,23 @@ def test_free_directions_of_several_contacts_are_those_that_nothing_holds():
     np.testing.assert_allclose(free.T @ free, np.eye(free.shape[1]), atol=1e-14)
     np.testing.assert_allclose(free[held], 0.0, atol=1e-14)
     np.testing.assert_allclose(section @ (free / weights[:, None])[n:], 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize(("crossings", "kept"), [(5, 3), (96, 48), (20, 20), (40, 17)])
+def test_without_kernels_the_last_of_many_states_are_kept(crossings, kept, monkeypatch):
+    """By a law that adds one to a state at each crossing, which takes a second and has two events."""
+
+    def returned(self, group, at, count, kept, peaks):
+        assert kept <= KEPT
+        path = at.y[:, None] + np.arange(count - kept + 1, count + 1)[:, None]
+        number = np.full(len(group), count)
+        return Images(at._replace(y=at.y + count), 2 * number, number, 1.0 * number, path, at.y[:, 0] + count)
+
+    monkeypatch.setattr(ReturnMaps, "_returns", returned)
+    maps = object.__new__(ReturnMaps)
+    maps.kernels = None
+    at = Section(np.array([[0.0, 0.0], [100.0, 100.0]]), np.zeros(2, int), np.zeros(2))
+    found = maps.returns(np.zeros(2, int), at, crossings, kept)
+    assert found.at.y[:, 0].tolist() == [crossings, 100 + crossings] and found.time.tolist() == [crossings] * 2
+    assert found.events.tolist() == [2 * crossings] * 2
+    np.testing.assert_array_equal(found.path[1, :, 0], 100 + np.arange(crossings - kept + 1, crossings + 1))

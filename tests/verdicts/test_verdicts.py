@@ -123,7 +123,7 @@ def test_without_damping_sliding_goes_on_below_coalescence_and_not_above():
     assert set(run.status[200:]) == {Status.SLIDE}
     share = np.abs(run.velocity[200:, 0]).max() / 2.0  # of the margin to sticking
     assert 0.5 * float(m["bound"][2]) <= share <= float(m["bound"][2]) < 1
-    for mu, c in ((0.25, 0.0), (0.1, 1e-17)):
+    for mu, c in ((0.25, 0.0), (0.1, 1e-17), (0.1, 1e-12)):
         other = scene.replace(mu=mu, c1=c, c2=c)
         assert not prover(other)(fj.sliding_equilibrium(other) + np.array([1e-9, 0.0, 0.0]), np.zeros(3))
 
