@@ -36,13 +36,13 @@ def concluded(search: FitSearch, identifiable_within: float) -> Calibration:
     models = [np.asarray(model) for model in best.at.about.models]
     left = _left(search, problem, found, models)
     outcome = _outcome(search, problem, left, models)
+    if outcome is FitOutcome.CONVERGED and (left.smaller or not _stated(search.recordings)):
+        # The residuals are noise, and tell its size better than the estimate that was made before the fit.
+        deviations = deviations * np.sqrt(max(left.misfit, ROUNDING))
     identified = (deviations[:size] <= identifiable_within) & (outcome in FITTED)
     if outcome is not FitOutcome.CONVERGED:
         # Standard deviations hold for a right model at a minimum; elsewhere they are unknown.
         deviations = np.full_like(deviations, np.inf)
-    elif left.smaller or not _stated(search.recordings):
-        # The residuals are noise, and tell its size better than the estimate that was made before the fit.
-        deviations = deviations * np.sqrt(max(left.misfit, ROUNDING))
     offsets: list = [None] * len(problem.misfits)
     for k in search.moved:
         place, mine = problem.places[k].start, problem.misfits[k]

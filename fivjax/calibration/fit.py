@@ -98,6 +98,7 @@ def calibrate(
             )
     arguments.whole_number("starts", starts, minimum=1)
     arguments.real_number("spread", spread, above=0, maximum=0.9)
+    arguments.whole_number("seed", seed, minimum=0)
     arguments.real_number("identifiable_within", identifiable_within, above=0)
     method = EventExact() if method is None else method
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
@@ -181,12 +182,27 @@ def _check_recording(scene: Scene, recording: Recording, k: int) -> None:
                 f"Recording {k} has a channel `{channel}`: the normal coordinate does not move while sliding."
             )
     own = scene.replace(**recording.known)
-    if recording.regime == "limit cycle" and len(recording.t) < 2 * SHORTEST:
-        raise ValueError(f"Recording {k} is too short: {len(recording.t)} samples of a limit cycle. Record for longer.")
+    if recording.regime == "limit cycle":
+        _check_cycle(own, recording, k)
     if recording.y0 is not None:
         start_state(own, recording.y0)
     elif not starts_unknown(own, recording):
         sliding_equilibrium(own)
+
+
+def _check_cycle(scene: Scene, recording: Recording, k: int) -> None:
+    if len(recording.t) < 2 * SHORTEST:
+        raise ValueError(f"Recording {k} is too short: {len(recording.t)} samples of a limit cycle. Record for longer.")
+    modes = sliding_frequencies(scene)
+    if not len(modes):
+        raise ValueError(
+            f"Recording {k} is of a limit cycle, but no mode of this scene vibrates: all are overdamped. Check its damping."
+        )
+    if recording.rate <= 2 * modes.min():
+        raise ValueError(
+            f"Recording {k} has {recording.rate:g} samples per second, fewer than two in a period of this scene's slowest mode "
+            f"({modes.min():.4g} Hz), so that they do not tell the frequency of a limit cycle. Record at a higher rate."
+        )
 
 
 def _check_samples(recording: Recording, k: int) -> None:

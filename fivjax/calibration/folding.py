@@ -2,8 +2,8 @@ r"""A periodic recording folded into one period: its frequency, its waveform, it
 
 Samples of a vibration of frequency f that are taken at instants t show its waveform at the phases f t, up to whole turns. Over
 many periods these lie close together, however few samples a period has: of a vibration of 68 Hz, a thousand samples per second
-show a thousand phases in a second. So a low rate loses nothing. In a spectrum, lines that are too high for the rate would look
-like others.
+show a thousand phases in a second. So a rate that is low for the higher lines loses nothing. It must be
+above twice the fundamental, which is found in a spectrum: there lines that are too high for the rate look like others.
 
 `folded` finds the frequency, and means of the samples over groups of neighbouring phases, for a few parts of the recording:
 from part to part a waveform of another frequency moves. What differs between neighbours is noise. What is then left beside the

@@ -35,7 +35,7 @@ class FreeParameters(eqx.Module):
         names = arguments.listed_names("free", free, "mu")
         if not names:
             raise ValueError("Argument `free` must name at least one parameter, but is empty.")
-        bounds = arguments.bounds_by_name("bounds", {} if bounds is None else bounds, '"mu": (0.1, 0.5)')
+        bounds = arguments.by_name("bounds", bounds, '"mu": (0.1, 0.5)')
         known = scene.parameters
         for name in (*names, *bounds):
             if name not in known:

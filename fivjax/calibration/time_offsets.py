@@ -46,7 +46,7 @@ def best_offsets(
 def periods_aside(
     problem: Problem, k: int, bounds: tuple[float, float], x: np.ndarray
 ) -> tuple[list[np.ndarray], float]:
-    """The points `x` with the offset of recording k changed by whole periods, where the bounds allow it; and half a period.
+    """Points like `x` with the offset of recording k changed by whole periods, where the bounds allow it; and half a period.
 
     A vibration is similar to itself a period later, so these may be better minima.
     """

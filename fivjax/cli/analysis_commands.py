@@ -34,44 +34,35 @@ class Cea:
         along = dict([axis(self.x, least=2)])  # with a single value there would be no lines to draw
         self.scene.refuse_constant_friction(x=next(iter(along)))
         direction = 1 if self.scene.belt_speed >= 0 else -1
-        if self.scene.structure is not None:
-            self._of_file(along, direction, data, picture)
-            return
-        scene = self.scene.scene()
-        dataset = fj.cea.modes(scene, **along)
-        write_data(dataset, data)
-        write_picture(fj.plot.linear.eigenvalues(dataset), picture)
-        _print_growth(scene)
-        limit = fj.cea.stability_limit(scene.structure, direction=direction)
-        if limit.outcome is fj.cea.StabilityOutcome.FOUND:
-            print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
-            print(fj.cea.sensitivity(scene.structure, direction=direction))
-        else:
-            print(f"  {limit}")
-
-    def _of_file(self, along: dict, direction: int, data: Path, picture: Path) -> None:
-        """Modes of a structure from files; a load is needed only where the modes depend on it."""
-        if self.scene.load:
+        if self.scene.structure is None or self.scene.load:
             scene = self.scene.scene()
             structure, dataset = scene.structure, fj.cea.modes(scene, **along)
-            _print_growth(scene)
-        elif self.scene.mu_static is not None or set(along) != {"mu"}:
-            raise ValueError(
-                "Option `--load` is missing: without it modes can be followed over constant friction only, `--x mu=…`."
-            )
         else:
-            structure = self.scene.reduced()
+            scene, structure = None, self._structure_without_load(along)
             dataset = fj.cea.modes(structure, direction=direction, **along)
         write_data(dataset, data)
         write_picture(fj.plot.linear.eigenvalues(dataset), picture)
+        _print_growth(scene)
         limit = fj.cea.stability_limit(structure, direction=direction)
-        found = f" {float(limit.mu):.6g} at {float(limit.frequency):.2f} Hz" if limit.mu < float("inf") else ""
-        print(f"  critical friction: {limit.outcome.value}{found}")
+        if limit.outcome is fj.cea.StabilityOutcome.FOUND:
+            print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
+            if structure.parameters:
+                print(fj.cea.sensitivity(structure, direction=direction))
+        else:
+            print(f"  {limit}")
+
+    def _structure_without_load(self, along: dict):
+        """The structure from files, where its modes do not depend on a load."""
+        if self.scene.mu_static is not None or set(along) != {"mu"}:
+            raise ValueError(
+                "Option `--load` is missing: without it modes can be followed over constant friction only, `--x mu=…`."
+            )
+        return self.scene.reduced()
 
 
-def _print_growth(scene: "Scene") -> None:
+def _print_growth(scene: "Scene | None") -> None:
     """Whether steady sliding under falling friction is stable: that does not follow from the critical friction."""
-    if not scene.friction.constant:
+    if scene is not None and not scene.friction.constant:
         growth = float(fj.cea.growth_rate(scene))
         stable = "unstable" if growth > 0 else "stable"
         print(

@@ -37,7 +37,7 @@ COMMANDS = {
 def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType | None], None] | None = None) -> int:
     """Run one command. Returns the exit code; errors are sentences on standard error.
 
-    0: success; 1: no result, or the disk did not take it; 2: refused before any work; 130: interrupted; 143: terminated.
+    0: success; 1: no result, or the disk did not take it; 2: refused; 130: interrupted; 143: terminated.
 
     `interrupt` is called when SIGINT or SIGTERM arrives, and raises `KeyboardInterrupt`; so does what stands in for it.
     """
@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
             print(f"fivjax: There is not enough memory for that ({error}); ask for less.", file=sys.stderr)
             return 1
         if isinstance(error, OSError):
-            print(f"fivjax: A result could not be written: {error}.", file=sys.stderr)
+            print(f"fivjax: What is needed on disk could not be written: {error}.", file=sys.stderr)
             return 1
         if isinstance(error, ValueError | TypeError | Failure):
             print(f"fivjax: {error}", file=sys.stderr)

@@ -62,10 +62,15 @@ class Branch:
         name, bounds = bound(self.over)
         self.scene.refuse_constant_friction(over=name)
         other, values = (None, [None]) if self.each is None else axis(self.each)
+        upwards = None if self.map is None else axis(self.map)
+        for option, second in {"each": other, "map": None if upwards is None else upwards[0]}.items():
+            if second == name:
+                raise ValueError(
+                    f"Option `--{option}` must name another parameter than `--over`, but both are `{name}`."
+                )
         endings = [".nc"] if other is None else [f"-{k + 1}.nc" for k in range(len(values))]
         endings += [] if self.map is None else ["-map.nc"]
         *data, picture = output_paths(self.out, self.overwrite, *endings, ".png")
-        upwards = None if self.map is None else axis(self.map)
         scene = self.scene.scene()
         branches = {}
         labels = [""] if other is None else [f"{other} = {value}" for value in apart(*values)]

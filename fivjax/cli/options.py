@@ -101,8 +101,12 @@ class MethodOptions:
 
     method: Literal["event-exact", "where-switched"] = "event-exact"
     """exact through contact events, or status switching at the ends of fixed steps"""
-    dt: float = 5e-5
-    """step of the where-switched method (s)"""
+    dt: float | None = None
+    """step of the where-switched method (s); 5e-5 unless given"""
 
     def stepper(self) -> "AbstractStepper":
-        return fj.EventExact() if self.method == "event-exact" else fj.WhereSwitched(dt=self.dt)
+        if self.method == "where-switched":
+            return fj.WhereSwitched() if self.dt is None else fj.WhereSwitched(dt=self.dt)
+        if self.dt is not None:
+            raise ValueError("Option `--dt` is of `--method where-switched`; steps to exact events have no fixed size.")
+        return fj.EventExact()

@@ -234,7 +234,7 @@ def _checked(scene: Scene, by, free, bounds):
     arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p is raised")
     arguments.real_number("by", by, above=0)
-    bounds = arguments.bounds_by_name("bounds", {} if bounds is None else bounds, '"k1": (90e3, 110e3)')
+    bounds = arguments.by_name("bounds", bounds, '"k1": (90e3, 110e3)')
     names = arguments.listed_names("free", free, "k1") or tuple(bounds)
     if not names:
         raise ValueError('Argument `free` must name at least one parameter, such as ["k1", "c2"].')

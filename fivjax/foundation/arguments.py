@@ -159,8 +159,10 @@ def listed_names(name: str, value, example: str) -> tuple[str, ...]:
     return tuple(map(str, names))
 
 
-def bounds_by_name(name: str, value, example: str) -> dict:
-    """Bounds as a dictionary, whose values are still to be checked."""
+def by_name(name: str, value, example: str) -> dict:
+    """A dictionary, whose values are still to be checked; empty where none is given."""
+    if value is None:
+        return {}
     if not isinstance(value, Mapping):
         raise TypeError(f"Argument `{name}` must be a dictionary, such as {{{example}}}, but is {describe(value)}.")
     return dict(value)

@@ -14,7 +14,7 @@ MOST_SQUARINGS = 32
 
 
 def exponential(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """exp of a matrix, by scaling and squaring (Higham 2005); NaN where its 1-norm is above 10¹⁰."""
+    """exp of a matrix, by scaling and squaring (Higham 2005); NaN where its 1-norm is above 2·10¹⁰."""
     norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=0)))
     squarings = jnp.maximum(jnp.ceil(jnp.log2(jnp.maximum(norm / LARGEST, 1.0))), 0.0)
     scaled = matrix * jnp.exp2(-squarings)

@@ -102,3 +102,14 @@ QUANTITIES = {
     "only_crossing": ("whether no other crossing was seen above the first", "1"),
     "crossings": ("number of verdict changes seen over the range of p", "1"),
 }
+
+
+def quantity_of(name: str) -> tuple[str, str] | None:
+    """The long name and the unit of a parameter or result; None for one that fivjax does not name. That of one of several
+    contacts has the contact's number behind its name.
+    """
+    quantity, contact = (name, "") if name in QUANTITIES else name.rpartition("_")[::2]
+    if quantity not in QUANTITIES or (contact and not contact.isdecimal()):
+        return None
+    long_name, unit = QUANTITIES[quantity]
+    return (f"{long_name}, contact {contact}" if contact else long_name), unit

@@ -37,7 +37,7 @@ class Accessor:
     def plot(self, **options):
         """The picture of the dataset, a matplotlib figure; `options` are those of the function of `fj.plot` that draws it.
 
-        **Raises:** `TypeError` where there is no picture of such a dataset.
+        **Raises:** `ValueError` where there is no picture of such a dataset.
         """
         return _drawing[0](self._dataset, **options)
 

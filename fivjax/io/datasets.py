@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from ..foundation import arguments
-from ..foundation.quantities import QUANTITIES as QUANTITIES
+from ..foundation.quantities import quantity_of
 from ..model.description import describe as describe
 from ..model.scene import Scene
 from . import accessor
@@ -32,25 +32,16 @@ if TYPE_CHECKING:
 
 
 def label(variable: "xr.DataArray") -> "xr.DataArray":
-    """The variable with its long name and unit; that of one of several contacts has the contact's number behind its name."""
-    if (known := _quantity(str(variable.name))) is not None:
+    """The variable with its long name and unit."""
+    if (known := quantity_of(str(variable.name))) is not None:
         variable.attrs.update(zip(("long_name", "units"), known, strict=True))
     return variable
 
 
 def unit_of(name: str) -> str:
     """The unit of a parameter or result; "" for one that fivjax does not name."""
-    known = _quantity(name)
+    known = quantity_of(name)
     return "" if known is None else known[1]
-
-
-def _quantity(name: str) -> tuple[str, str] | None:
-    """The long name and the unit of a parameter or result."""
-    quantity, contact = (name, "") if name in QUANTITIES else name.rpartition("_")[::2]
-    if quantity not in QUANTITIES or (contact and not contact.isdecimal()):
-        return None
-    long_name, unit = QUANTITIES[quantity]
-    return (f"{long_name}, contact {contact}" if contact else long_name), unit
 
 
 def labelled(dataset: "xr.Dataset", scene: Scene, **settings) -> "xr.Dataset":

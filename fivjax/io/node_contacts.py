@@ -126,7 +126,12 @@ def contact_directions(
 def load_direction(load: Mapping, order: tuple[Label, ...] | None, size: int) -> np.ndarray:
     """Each coordinate's share of a positive load, without unit."""
     found = np.zeros(size)
-    for (node, direction), share in load.items():
+    for place, share in load.items():
+        if not isinstance(place, tuple) or len(place) != 2:
+            raise ValueError(
+                f"Argument `load` must have pairs of a node and a direction, such as (903, 'z'), but has {place!r}."
+            )
+        node, direction = place
         arguments.real_number(f"load[{node}, {direction!r}]", share)
         found += share * _along(node, direction, order, size)
     return found

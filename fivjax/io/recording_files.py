@@ -81,8 +81,9 @@ def read_recording(
     arguments.real_number("full_scale", full_scale, above=0)
     if rate is not None:
         arguments.real_number("rate", rate, above=0)
+    units = arguments.by_name("units", units, '"a0": "g"')
+    columns = None if columns is None else arguments.by_name("columns", columns, '"Acc_X": "acceleration 0"')
     found, own_units, own_rate = readers[path.suffix.lower()](path)
-    units = {**own_units, **(units or {})}
     scale = full_scale if path.suffix.lower() == ".wav" else 1.0
     if columns is None:
         columns = {name: name for name in found if _is_channel(name)}
@@ -91,8 +92,9 @@ def read_recording(
                 f"File `{path}` names no channel such as `acceleration 0`; it has: {', '.join(found)}. Say which is "
                 f"which with `columns`."
             )
-    for name in columns:
+    for name in (*columns, *units):
         _must_have(path, found, name)
+    units = {**own_units, **units}
     signals = {}
     for name, meaning in columns.items():
         unit = _unit(path, name, channel(meaning).quantity, units)

@@ -18,7 +18,7 @@ from ..foundation import arguments
 from ..foundation.digits import apart
 from .low_pass import FrequencyResponse, frequency_response
 
-# Quantities of a channel, in the order of their derivatives by time; and how a channel's name may begin.
+# Quantities of a channel, in the order of their derivatives by time.
 QUANTITIES = ("displacement", "velocity", "acceleration")
 # Time stamps are often rounded to few digits; steps that differ by more than this share of a step are uneven.
 UNEVEN = 0.05

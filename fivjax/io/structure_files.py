@@ -59,8 +59,8 @@ def read_structure(
       rows without labels) become metres; rotations are in rad already, modal coordinates keep their scale.
     - `mass`, `damping`: their files, where they are not in the first one. Without a damping matrix, damping is zero.
     - `names`: the names of the matrices in files that hold several: `{"stiffness": "KAA", "mass": "MAA"}`.
-    - `labels`: node and direction of each row where the files do not say (OUTPUT4, Matrix Market, MATLAB, NumPy): pairs, or a
-      text file with two columns.
+    - `labels`: node and direction of each row where the files do not say (OUTPUT4, Matrix Market, Harwell-Boeing, MATLAB,
+      NumPy): pairs, or a text file with two columns.
     - `contacts`: see `fj.NodeContact`; or a file with the columns node, along, away (directions) and perhaps against (a node).
     - `load`: share of a positive load by node and direction: `{(903, "z"): -1.0}`, without unit.
     - `rayleigh`: damping that is added as a·M + b·K, a in 1/s and b in s.
@@ -82,11 +82,17 @@ def read_structure(
             f"Argument `units` must be one of {', '.join(map(repr, SYSTEMS))}, but is {units!r}. Files do not say which; "
             f"mass in t, forces in N and lengths in mm are 'mm-t-s'."
         )
-    names = dict(names or {})
+    names = arguments.by_name("names", names, '"stiffness": "KAA"')
+    load = arguments.by_name("load", load, '(903, "z"): -1.0')
+    if not isinstance(rayleigh, tuple | list) or len(rayleigh) != 2:
+        raise TypeError(
+            f"Argument `rayleigh` must be a pair, such as (10.0, 1e-6), in 1/s and s, but is {arguments.describe(rayleigh)}."
+        )
     unknown = [role for role in names if role not in NAMES]
     if unknown:
         raise ValueError(f"Argument `names` must name {', '.join(NAMES)}, but has {unknown[0]!r}.")
     contacts = read_contacts(contacts) if isinstance(contacts, str | Path) else contacts
+    arguments.instance("contacts", contacts, Sequence, "a list of fj.NodeContact, or a file")
     if isinstance(path, Mapping) and path:
         parts, remarks = _given(path, {"mass": mass, "damping": damping, "names": names or None}), []
     else:
@@ -109,7 +115,7 @@ def read_structure(
     tangential, normal = contact_directions(contacts, order, len(directions))
     return SparseStructure(
         **matrices,
-        load_direction=load_direction(load or {}, order, len(directions)),
+        load_direction=load_direction(load, order, len(directions)),
         tangential_directions=tangential,
         normal_directions=normal,
         labels=order,

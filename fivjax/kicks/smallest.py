@@ -170,7 +170,7 @@ def smallest_kick(
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
     if not scene.friction.constant:
         raise ValueError("Argument `scene` must have constant friction: the bound is that of a linear sliding motion.")
-    bounds = arguments.bounds_by_name("bounds", {} if bounds is None else bounds, '"p": (1.0, 2.0)')
+    bounds = arguments.by_name("bounds", bounds, '"p": (1.0, 2.0)')
     if isinstance(over, str):
         arguments.one_of("over", over, (*OF_KICK, "state", "history"))
         if over not in OF_KICK:

@@ -27,6 +27,3 @@ from .sensitivities import sensitivity as sensitivity
 from .spectrum import eigenvalues as eigenvalues
 from .spectrum import growth_rate as growth_rate
 from .spectrum import linearisation as linearisation
-
-# A former name of `StabilityOutcome`.
-Outcome = StabilityOutcome

@@ -150,7 +150,7 @@ def lower_growth_rate(
         return jnp.max(jax.vmap(lambda value: growth_rate(candidate, value, direction=direction))(values))
 
     goal = _Goal("worst growth rate", quantity, target, direction, larger_is_better=False)
-    return _design(structure, _checked_bounds(structure, bounds, tied or {}), tied or {}, goal, steps, rate)
+    return _design(structure, _checked_bounds(structure, bounds, tied), tied or {}, goal, steps, rate)
 
 
 class _Goal(NamedTuple):
@@ -176,6 +176,8 @@ def _design(structure: Structure, within: "_Bounds", tied, goal: _Goal, steps: i
     name, quantity, target, direction, larger_is_better = goal
     names, low, width = within
     check_axis_names({*names, *tied}, ("step", name.replace(" ", "_")), "designs")
+    arguments.whole_number("steps", steps, minimum=1)
+    arguments.real_number("rate", rate, above=0)
     start = np.array([(float(structure.parameters[key]) - low[i]) / width[i] for i, key in enumerate(names)])
 
     def values(shares):
@@ -237,10 +239,18 @@ class _Bounds(NamedTuple):
 
 def _checked_bounds(structure: Structure, bounds, tied) -> _Bounds:
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
-    bounds = arguments.bounds_by_name("bounds", bounds, '"k1": (90e3, 110e3)')
+    bounds = arguments.by_name("bounds", bounds, '"k1": (90e3, 110e3)')
     if not bounds:
         raise ValueError('Argument `bounds` must name at least one parameter, such as {"k1": (90e3, 110e3)}.')
     known = ", ".join(structure.parameters) or "none (it was given as matrices)"
+    tied = arguments.by_name("tied", tied, '"k2": lambda own: 2 * own["k1"]')
+    for key, rule in tied.items():
+        if not callable(rule):
+            raise TypeError(
+                f"Argument `tied[{key!r}]` must be a function of the parameters, but is {arguments.describe(rule)}."
+            )
+        if key in bounds:
+            raise ValueError(f"Parameter `{key}` is both in `bounds` and in `tied`. Drop one of the two.")
     for key in (*bounds, *tied):
         if key not in structure.parameters:
             near = arguments.did_you_mean(str(key), structure.parameters)

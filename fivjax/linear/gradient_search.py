@@ -132,6 +132,7 @@ def search_critical_friction(
     arguments.real_number("highest", highest, minimum=float(start))
     arguments.one_of("route", route, ("eigenvalues", "routh-hurwitz"))
     check_direction(direction)
+    arguments.whole_number("max_steps", max_steps, minimum=1)
     if route == "routh-hurwitz" and is_known(structure.damping) and not np.any(np.asarray(structure.damping)):
         raise ValueError(
             'Argument `route` must be "eigenvalues" for an undamped structure: all its motions are on the limit, so '

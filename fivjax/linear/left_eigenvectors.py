@@ -86,14 +86,18 @@ def shape_basis(pencil: Pencil, *modes: ComplexModes, coordinates: int = 60) -> 
         basis = fj.cea.shape_basis(brake(6.0), *points)
         fj.cea.complex_modes(brake(12.0).projected(basis))      # at any speed between, in no time
 
-    The leading left singular vectors of all real and imaginary parts, with equal kinetic energy for each mode.
+    The leading left singular vectors of all real and imaginary parts, with about equal kinetic energy for each mode: by the
+    masses on the diagonal.
 
     **Arguments:** `pencil`, whose mass matrix gives the kinetic energy; `modes`, of pencils with the same coordinates;
     `coordinates`, the largest number of columns.
 
     **Returns:** `(n, m)`, with m at most `coordinates`.
     """
-    arguments.real_number("coordinates", coordinates, minimum=1)
+    arguments.instance("pencil", pencil, Pencil, "a Pencil, such as `cea.sliding_pencil` returns")
+    arguments.whole_number("coordinates", coordinates, minimum=1)
+    for k, found in enumerate(modes):
+        arguments.instance(f"modes[{k}]", found, ComplexModes, "modes, such as `cea.complex_modes` returns")
     if not modes or any(found.shapes.shape[0] != pencil.size for found in modes):
         raise ValueError(f"Argument `modes` must hold modes of pencils with {pencil.size} coordinates, at least one.")
     weight = np.sqrt(np.abs(pencil.mass.diagonal()))
@@ -101,4 +105,4 @@ def shape_basis(pencil: Pencil, *modes: ComplexModes, coordinates: int = 60) -> 
     shapes = np.hstack([found.shapes for found in modes]) * weight
     shapes = shapes / np.linalg.norm(shapes, axis=0)
     columns, sizes, _ = np.linalg.svd(np.hstack([shapes.real, shapes.imag]), full_matrices=False)
-    return (columns / weight)[:, : min(int(coordinates), int(np.sum(sizes > 1e-12 * sizes[0])))]
+    return (columns / weight)[:, : min(coordinates, int(np.sum(sizes > 1e-12 * sizes[0])))]

@@ -250,7 +250,13 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
 
     n, unit = pencil.size, abs(shift)
     # An ordering for the matrix plus its transpose: a third less fill-in than one for columns alone.
-    factors = splu(pencil.at(shift), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
+    try:
+        factors = splu(pencil.at(shift), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
+    except RuntimeError:
+        raise ValueError(
+            f"The pencil is singular at {shift:.6g} 1/s, so its modes cannot be computed: some coordinate has neither mass nor "
+            f"stiffness. Hold it, or give it some."
+        ) from None
     relative, mass, damping = shift / unit, unit**2 * pencil.mass, unit * pencil.damping
 
     def shift_inverse(state):

@@ -147,6 +147,9 @@ class _Bases(NamedTuple):
         from scipy import sparse
         from scipy.linalg import null_space
 
+        arguments.instance(
+            "system", system, Structure | SparseStructure, "a Structure, or what `read_structure` returns"
+        )
         normal, tangential = system.normal_directions, system.tangential_directions
         if not normal.shape[1]:
             raise ValueError("The structure has no contacts. Give `contacts` to `read_structure`, or use `cea.Pencil`.")

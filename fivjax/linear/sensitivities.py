@@ -9,7 +9,7 @@ import numpy as np
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
-from ..foundation.quantities import QUANTITIES
+from ..foundation.quantities import quantity_of
 from ..io.datasets import labelled
 from ..model.structure import Structure
 from .critical import critical_friction, stability_limit
@@ -87,7 +87,7 @@ def sensitivity(structure: Structure, *, direction: int = 1) -> Sensitivity:
                 plain[name] = np.nan
     mu_crit = float(limit.mu)
     numbers = {name: float(value) for name, value in values.items()}
-    units = [QUANTITIES[name][1] if name in QUANTITIES else UNITS.get(name.split("[")[0], "?") for name in values]
+    units = [(quantity_of(name) or ("", UNITS.get(name.split("[")[0], "?")))[1] for name in values]
     dataset = xr.Dataset(
         {
             "sensitivity": ("parameter", np.array(list(plain.values())), {"long_name": "d mu_crit / d parameter"}),

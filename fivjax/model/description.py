@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation.precision import in_double_precision
-from ..foundation.quantities import QUANTITIES
+from ..foundation.quantities import quantity_of
 from ..foundation.traced_code import digest
 from .belt import belt_oscillator
 from .contact_point import ContactPoint
@@ -227,7 +227,7 @@ def as_table(scene) -> str:
     about = describe(scene)
     rows = []
     for name, value in about["parameters"].items():
-        meaning, unit = QUANTITIES.get(name, (name, ""))
+        meaning, unit = quantity_of(name) or (name, "")
         shown = f"{value:g}" if isinstance(value, int | float) else f"{np.size(value)} values"
         rows.append([name, meaning, shown, "" if unit == "1" else unit])
     left = "style='text-align:left'"

@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 def show(result, **options) -> Figure:
     """The picture of a result.
 
-    **Arguments:** `result`, a `Trajectory`, a `LimitCycle` (one period), a map, basins, a critical perturbation, modes, a
-    stability chart, energies per cycle, sensitivities, a `tradeoff` or a `Calibration`; `options` are those of the function of
-    `fj.plot` that draws it.
+    **Arguments:** `result`, a `Trajectory`, a `LimitCycle` (one period), a map, basins, a critical perturbation, a branch, a
+    boundary section, modes, a stability chart, energies per cycle, sensitivities, a `tradeoff` or a `Calibration`; `options`
+    are those of the function of `fj.plot` that draws it.
 
     **Returns:** a matplotlib figure.
 
-    **Raises:** `TypeError` for anything that has no picture, `ValueError` for a dataset with more axes than a picture has.
+    **Raises:** `TypeError` for anything that fivjax did not compute, `ValueError` for a dataset without a picture, or with more
+    axes than one has.
 
     **Example:**
 

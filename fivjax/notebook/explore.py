@@ -54,7 +54,14 @@ def explorer(
     arguments.real_number("t1", t1, above=0)
     if dataset is not None:
         arguments.instance("dataset", dataset, xr.Dataset, "a map, such as `bistability_map` returns")
-    return Explorer(scene, dataset, float(t1), dict(ranges or {}))
+    ranges = arguments.by_name("ranges", ranges, '"mu": (0.1, 0.4)')
+    for name, pair in ranges.items():
+        ends = arguments.numeric_array(f"ranges[{name!r}]", pair)
+        if ends.shape != (2,) or not ends[0] < ends[1]:
+            raise ValueError(
+                f"Argument `ranges` must hold the two ends of each slider, the lower one first, but `{name}` has {pair!r}."
+            )
+    return Explorer(scene, dataset, float(t1), ranges)
 
 
 @final

@@ -15,6 +15,10 @@ class MapPicture:
     """A map of two axes, with the scene for which it was computed: that of the dataset if it has one, else the one given."""
 
     def __init__(self, dataset: xr.Dataset, scene: Scene):
+        if "verdict" not in dataset:
+            raise ValueError(
+                "Argument `dataset` must be a map, such as `bistability_map` returns: it has no `verdict`."
+            )
         self.dataset = dataset
         self.scene = Scene.from_dataset(dataset) if "scene" in dataset.attrs else scene
         self.values = {str(name): dataset[name].values for name in dataset["verdict"].dims}

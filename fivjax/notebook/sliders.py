@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..foundation.quantities import QUANTITIES
+from ..foundation.quantities import quantity_of
 from ..model.scene import Scene
 
 FIRST = ("mu", "mu_static", "mu_dynamic", "p", "belt_speed")
@@ -51,7 +51,7 @@ def slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     step = float(power * max(k for k in (1, 2, 5) if k <= finest / power * (1 + 1e-9)))
     # A browser rounds to steps from the lower end, so the scene's value must be a whole number of steps from it.
     low = max(low, float(np.round(value - step * np.floor((value - low) / step + 1e-9), 12)))
-    unit = next((QUANTITIES[one][1] for one in (name, _kind(name)) if one in QUANTITIES), "1")
+    _, unit = quantity_of(name) or (name, "1")
     return widgets.FloatSlider(
         value,
         min=low,

@@ -1,4 +1,4 @@
-"""Pictures of results. Every function takes results, returns a matplotlib `Figure`, and computes nothing.
+"""Pictures of results. Every function takes results, returns a matplotlib `Figure`, and computes no results.
 
 Read first: `style`, by which all of them look alike, and `maps` as one of them. `fj.plot` has what is listed here; `energy`,
 `linear` and `fits` are also `fj.plot_energy`, `fj.plot_linear` and `fj.plot_calibration`.

@@ -8,10 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ..foundation import arguments
 from ..simulation.trajectory import Trajectory
 from ._windows import Window, align_zeros, inside, ledger, legend_between, legend_of_figure, shade, styles
 from .contact_status import STATUS_NAMES
-from .style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILION, check_dataset, legend_above, new_figure
+from .style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILION, check_dataset, check_run, legend_above, new_figure
 
 PER_CYCLE = {"contact_work": "energy from the contact", "energy_gain": "energy gained"}
 
@@ -19,7 +20,7 @@ PER_CYCLE = {"contact_work": "energy from the contact", "energy_gain": "energy g
 def contact_exchange(run: Trajectory, cycles: xr.Dataset, window: Window, *, figure: Figure | None = None) -> Figure:
     """Tangential displacement and status above; power at the contact and its work in each cycle below (Fig. 13).
 
-    **Raises:** `ValueError` for a run without a ledger, or a window that contains none of its instants.
+    **Raises:** `ValueError` for a run without a ledger, or a window that holds fewer than two of its instants.
     """
     figure = new_figure(figure, 8.0, 4.8)
     upper, lower = figure.subplots(2, 1, sharex=True)
@@ -44,7 +45,7 @@ def detachments(
     `window` is one for all runs, or a window for each run by label. Detached times are shown over the whole runs, or over
     `overview` if it is given.
 
-    **Raises:** `ValueError` for a run without a ledger, or a window that contains none of its instants.
+    **Raises:** `ValueError` for a run without a ledger, or a window that holds fewer than two of its instants.
     """
     figure = new_figure(figure, 4.2 * len(runs), 5.4)
     grid = figure.add_gridspec(2, len(runs), height_ratios=(1, 1))
@@ -83,8 +84,10 @@ def growth(
     The window shows velocity, contact power, and for each cycle the growth of mechanical energy ("energy_gain") or the work of
     the contact ("contact_work").
 
-    **Raises:** `ValueError` for a run without a ledger, or a window that contains none of its instants.
+    **Raises:** `ValueError` for a run without a ledger, or a window that holds fewer than two of its instants.
     """
+    check_run(run)
+    arguments.one_of("per_cycle", per_cycle, PER_CYCLE)
     figure = new_figure(figure, 8.0, 7.2)
     whole, strip, middle, lower = figure.subplots(4, 1, height_ratios=(2, 0.7, 1.6, 1.6))
     tangential = run.scene.structure.tangential
@@ -111,6 +114,8 @@ def growth(
 def per_cycle(cycles: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """Energy over each cycle by line of the ledger, and the time of sticking and of detachment in each cycle.
 
+    With several contacts, the later they are, the thinner is the line of their times.
+
     **Raises:** `TypeError` for anything but energies per cycle.
     """
     check_dataset(cycles, ("contact_work", "energy_gain"), "fj.energy_per_cycle(run)", "cycles")
@@ -131,7 +136,10 @@ def per_cycle(cycles: xr.Dataset, *, figure: Figure | None = None) -> Figure:
         ("stick_time", "sticking", ORANGE, "-"),
         ("detach_time", "detached", BLUE, "--"),
     ):
-        lower.plot(start, 1e3 * cycles[name], color=colour, ls=style, lw=1.2, label=label)
+        times = 1e3 * cycles[name].values.reshape(len(start), -1)
+        for contact, own in enumerate(times.T):
+            named = label if times.shape[1] == 1 else f"{label}, contact {contact}"
+            lower.plot(start, own, color=colour, ls=style, lw=2.4 / (2 + contact), label=named)
     lower.set(xlabel="time (s)", ylabel="per cycle (ms)", ylim=(0, None))
     legend_above(lower, columns=2)
     return figure

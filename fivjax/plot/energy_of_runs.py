@@ -13,7 +13,7 @@ from .style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILION, check_runs, le
 def mechanical_power(run: Trajectory, windows: Sequence[Window], *, figure: Figure | None = None) -> Figure:
     """Power into the structure, of contact and load minus damping, in several windows (Fig. 7).
 
-    **Raises:** `ValueError` for a run without a ledger, or a window that contains none of its instants.
+    **Raises:** `ValueError` for a run without a ledger, or a window that holds fewer than two of its instants.
     """
     power = ledger(run).power.mechanical
     figure = new_figure(figure, 3.4 * len(windows), 3.4)
@@ -35,7 +35,7 @@ def mechanical_energy(
 ) -> Figure:
     """Kinetic and elastic energy over time, of one run or of several by label (Fig. 12), or in several windows (Fig. 11).
 
-    **Raises:** `ValueError` for a run without a ledger, or a window that contains none of its instants.
+    **Raises:** `ValueError` for a run without a ledger, or a window that holds fewer than two of its instants.
     """
     runs = dict(runs) if isinstance(runs, Mapping) else {"": runs}
     check_runs(runs)
@@ -59,7 +59,7 @@ def slip_reversal(
 ) -> Figure:
     """Tangential velocity of several runs, and for each a window with slip velocity and friction force (Fig. 18).
 
-    **Raises:** `ValueError` for a window that contains none of a run's instants.
+    **Raises:** `ValueError` for a window that holds fewer than two of a run's instants.
     """
     figure = new_figure(figure, 8.0, 2.4 + 2.2 * len(runs))
     whole, *panels = figure.subplots(1 + len(runs), 1)

@@ -36,7 +36,7 @@ def response(
     **Arguments:** `run`; `quantity`, "displacement", "velocity" or "acceleration"; `coordinate`, by its number, the
     tangential one unless given. With several contacts, a given coordinate is drawn without status.
 
-    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for another quantity.
+    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for another quantity, or no coordinate of the structure.
 
     **Example:**
 
@@ -44,6 +44,10 @@ def response(
     """
     check_run(run)
     structure = run.scene.structure
+    if coordinate is not None:
+        arguments.whole_number("coordinate", coordinate, minimum=0)
+        if coordinate >= structure.size:
+            raise ValueError(f"Argument `coordinate` must be at most {structure.size - 1}, but is {coordinate}.")
     several = len(structure.contacts) > 1
     places = [tangential for tangential, _ in structure.places] if coordinate is None else [coordinate]
     figure = new_figure(figure, 8.0, 3.6 if len(places) == 1 else 1.2 + 1.6 * len(places))

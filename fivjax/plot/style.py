@@ -13,7 +13,7 @@ from matplotlib.legend import Legend
 from matplotlib.patches import Patch
 
 from ..foundation import arguments
-from ..foundation.quantities import QUANTITIES
+from ..foundation.quantities import quantity_of
 from ..model.structure import Structure
 from ..simulation.trajectory import Trajectory
 
@@ -43,7 +43,7 @@ def with_unit(text: str, unit: str) -> str:
 
 def axis_label(name) -> str:
     """The label of a parameter or result, by its name in fivjax."""
-    long_name, unit = QUANTITIES.get(str(name), (str(name), "1"))
+    long_name, unit = quantity_of(str(name)) or (str(name), "1")
     symbols = {"mu": r" $\mu$", "p": " $p$"}
     return with_unit(long_name + symbols.get(str(name), ""), unit)
 

@@ -28,11 +28,12 @@ from .start import checked_start, start_in_contact_coordinates, start_state
 from .trajectory import Trajectory, simulate
 
 # What has a derivative that is not worked out.
-JUMPS_AT_ONCE = "two jumps of the load, which a parameter moves apart,"
-LANDINGS_OF_SEVERAL = "a landing with hardly any restitution, of several contacts under this impact law,"
+JUMPS_AT_ONCE = "two jumps of the load at one instant, which a parameter moves apart"
+LANDINGS_OF_SEVERAL = "a landing of several contacts with hardly any restitution, under this impact law"
 HELD_BY_STATIC_FRICTION = (
-    "a landing after which static friction alone holds the contact, which the least rebound makes slide,"
+    "a landing after which static friction alone holds the contact, and the least rebound makes it slide"
 )
+NOT_WORKED_OUT = (JUMPS_AT_ONCE, LANDINGS_OF_SEVERAL, HELD_BY_STATIC_FRICTION)
 # By the restitution, how far rebounds are from vanishing.
 NO_REBOUND = "a landing without a rebound, at restitution 0,"
 # With less restitution, rebounds end in no time. What follows is worked out for one contact, and for impacts with friction.
@@ -74,12 +75,13 @@ class Derivatives(eqx.Module):
             )
         if not np.isfinite(self.closest):
             return "The derivatives exist: no contact event comes anywhere near."
-        where = (
-            f"{self.closest_event} at t = {self.closest_at:.6g} s, {self.closest:.1e} of its range away from changing"
-        )
+        where = f"{self.closest_event} at t = {self.closest_at:.6g} s"
+        if self.closest_event in NOT_WORKED_OUT:
+            return f"No derivative can be relied on: it is not worked out for {where}."
+        call = f"The closest call is {where}, {self.closest:.1e} of its range away from changing."
         if self.exist:
-            return f"The derivatives exist. The closest call is {where}."
-        return f"No derivative can be relied on: {where}, the sequence of events is about to be another."
+            return f"The derivatives exist. {call}"
+        return f"No derivative can be relied on, because the sequence of events is about to be another. {call}"
 
 
 @reported("derivatives")
@@ -217,7 +219,7 @@ def _missing(scene: Scene, t1: float, moved: dict[str, np.ndarray], calls: Close
     if several and landed and np.any(moves & (restitution < LITTLE)):
         return dataclasses.replace(calls, closest=0.0, at=calls.landed_at, event=LANDINGS_OF_SEVERAL)
     if calls.held < 0 and np.any(moves & (restitution == 0)):
-        return dataclasses.replace(calls, closest=0.0, event=HELD_BY_STATIC_FRICTION)
+        return dataclasses.replace(calls, closest=0.0, at=calls.landed_at, event=HELD_BY_STATIC_FRICTION)
     least = float(np.min(restitution, where=moves & (restitution > 0), initial=np.inf))
     if landed and least < calls.closest:
         return dataclasses.replace(calls, closest=least, at=calls.landed_at, event=NO_REBOUND)

@@ -131,7 +131,7 @@ class Trajectory(eqx.Module):
                 f"Argument `dataset` must be a saved trajectory: variables {', '.join(rows)} and attributes `settings` and "
                 f"`outcome`, but some are missing or damaged. Save the trajectory again."
             ) from None
-        count, size = len(values["t"]), len(scene.structure.coordinates)
+        count, size = values["t"].size, len(scene.structure.coordinates)
         for name, value in values.items():
             wide = name in OF_COORDINATES
             if value.dtype.kind not in "biuf" or value.shape[:1] != (count,) or (wide and value.shape != (count, size)):
