@@ -433,6 +433,15 @@ def test_other_guesses_do_not_lead_an_aliased_recording_away_from_the_scene():
         (dict(data=[1.0]), ["`data[0]`", "a Recording"]),
         (dict(starts=0), ["`starts`", "0"]),
         (dict(rate=-1.0), ["`rate`", "positive"]),
+        (dict(seed=-1), ["`seed`", "-1"]),
+        (
+            dict(data=fj.Recording(90.0, {"a0": RISING}, "limit cycle")),
+            ["90 samples per second", "fewer than two", "Hz"],
+        ),
+        (
+            dict(data=fj.Recording(25e3, {"a0": RISING}, "limit cycle"), scene=paper(c1=1e4, c2=3e4)),
+            ["limit cycle", "overdamped"],
+        ),
         (dict(method="exact"), ["`method`", "EventExact()"]),
         (dict(data=fj.Recording(25e3, {"a7": QUIET[:, 0]})), ["acceleration 7", "0 to 2"]),
         (dict(data=fj.Recording(25e3, {"a2": QUIET[:, 0]}, "sliding")), ["acceleration 2", "normal"]),

@@ -131,6 +131,9 @@ def test_calibrate(folder, capsys, arguments, fragments):
             ([command, "--mu-static", "0.3", "--mu-dynamic", "0.2"], [option, "`mu`", "mu_static"])
             for command, option in (("cea", "--x"), ("map", "--x"), ("branch", "--over"))
         ),
+        (["branch", "--over", "mu=0.1:0.3", "--each", "mu=0.1:0.2:2"], ["`--each`", "another parameter", "`mu`"]),
+        (["branch", "--over", "mu=0.1:0.3", "--map", "mu=0.1:0.2:2"], ["`--map`", "another parameter", "`mu`"]),
+        (["simulate", "--dt", "1e-5"], ["`--dt`", "`--method where-switched`"]),
         (["branch", "--over", "mu=0.2:0.22"], ["`bounds`", "0.227", "a scene whose mu lies between them"]),
         (["cea", "--x", "mu"], ["NAME=FROM:TO:COUNT", "'mu'"]),
         (["cea", "--x", "speed=1:2:3"], ["`speed`"]),
@@ -154,7 +157,7 @@ def test_calibrate(folder, capsys, arguments, fragments):
         (["simulate", "--k1", "0", "--k2", "0"], ["singular"]),
         (["simulate", "--t1", "1e9", "--dt-save", "1e-9"], ["`dt_save`", "rows"]),
         (["map", "--force", "nan"], ["`force`", "finite"]),
-        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["trajectories", "70,000,000,000,000 bytes"]),
+        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["trajectories", "78,000,000,000,000 bytes"]),
         (["map", "--x", "mu=0:1:100000000"], ["`mu`", "800,000,000 bytes"]),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else None,

@@ -66,6 +66,12 @@ def test_columns_by_name(tmp_path):
     path = csv(tmp_path, table("clock,Acc X", zip(T, A, strict=True)))
     found = fj.read_recording(path, columns={"Acc X": "acceleration 0"}, time="clock", units={"Acc X": "mm/s2"})
     np.testing.assert_allclose(found.values[:, 0], 1e-3 * A, atol=1e-12)
+    # A unit that is given for no column would be of no use.
+    with pytest.raises(ValueError, match="no variable `acc x`; it has: clock, Acc X"):
+        fj.read_recording(path, columns={"Acc X": "a0"}, time="clock", units={"acc x": "mm/s2"})
+    for wrong in ({"units": "g"}, {"columns": ["Acc X"]}):
+        with pytest.raises(TypeError, match=f"`{next(iter(wrong))}` must be a dictionary"):
+            fj.read_recording(path, time="clock", **wrong)
 
 
 def test_numpy_and_matlab_and_wav(tmp_path):

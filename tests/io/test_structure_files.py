@@ -521,6 +521,15 @@ REFUSED = {
     "directions that are not at right angles": ({"contacts": [fj.NodeContact(4, "x", (1, 1, 0))]}, r"at right angles"),
     "a pair instead of a contact": ({"contacts": [(4, "x")]}, r"`contacts\[0\]` must be an fj.NodeContact"),
     "a name that is no role": ({"names": {"spring": "K"}}, r"`names` must name stiffness"),
+    "one contact without a list": (
+        {"contacts": fj.NodeContact(4, "x", "y")},
+        r"`contacts` must be a list of fj.NodeContact",
+    ),
+    "one number of damping": ({"rayleigh": 0.1}, r"`rayleigh` must be a pair, such as \(10.0, 1e-6\)"),
+    "a load on a node alone": (
+        {"load": {4: -1.0}},
+        r"pairs of a node and a direction, such as \(903, 'z'\), but has 4",
+    ),
     "negative damping": ({"rayleigh": (-1.0, 0.0)}, r"`rayleigh\[0\]` must be non-negative"),
     "a file of another model": ({"mass": "other.mtx"}, r"not in the stiffness matrix, such as node 71"),
     "labels twice": ({"labels": [(1, 1), (1, 1)]}, r"holds node 1, direction 1 twice"),

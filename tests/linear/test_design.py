@@ -134,6 +134,18 @@ BELT = fj.belt_oscillator()
         (lambda: design.raise_critical_friction(BELT, {"k1": (-1e5, 3e5)}), "`k1` must be non-negative"),
         (lambda: design.raise_critical_friction(BELT, {"k1": (1e5, 3e5)}, target=-1.0), "`target` must be positive"),
         (
+            lambda: design.raise_critical_friction(BELT, {"k1": (1e5, 3e5)}, steps=0),
+            "`steps` must be a whole number of at least 1",
+        ),
+        (
+            lambda: design.raise_critical_friction(BELT, {"k1": (1e5, 3e5)}, tied={"k2": 5.0}),
+            r"tied\['k2'\]` must be a function",
+        ),
+        (
+            lambda: design.raise_critical_friction(BELT, {"k1": (1e5, 3e5)}, tied={"k1": lambda own: own["k2"]}),
+            "`k1` is both in `bounds` and in `tied`",
+        ),
+        (
             lambda: design.raise_critical_friction(BELT.replace(theta=0.0), {"k1": (1e5, 2e5)}),
             "the structure is never unstable",
         ),

@@ -226,6 +226,13 @@ def test_missing_widgets_are_named(scene, monkeypatch):
 def test_wrong_arguments_are_refused(scene, a_map):
     with pytest.raises(ValueError, match="must name parameters of the scene"):
         fj.explorer(scene, ranges={"stiffness": (0, 1)})
+    with pytest.raises(TypeError, match="`ranges` must be a dictionary"):
+        fj.explorer(scene, ranges=0.3)
+    for pair in (0.3, (0.4, 0.1)):
+        with pytest.raises(ValueError, match="the two ends of each slider, the lower one first, but `mu` has"):
+            fj.explorer(scene, ranges={"mu": pair})
+    with pytest.raises(ValueError, match="it has no `verdict`"):
+        fj.explorer(scene, a_map.drop_vars("verdict"))
     with pytest.raises(ValueError, match="map over parameters of the scene, but `x2` is none"):
         fj.explorer(scene, a_map.rename(mu="x2"))
     with pytest.raises(ValueError, match="two axes"):

@@ -328,6 +328,10 @@ def test_a_slice_of_a_map_is_selected_by_the_call_that_the_sentence_gives():
         (lambda: plot.energy.per_cycle(a_map()), r"what `fj.energy_per_cycle\(run\)` returns"),
         (lambda: plot.calibration(None), r"such as `fivjax.calibrate\(.*\)`, but is None"),
         (lambda: plot.response(still(), "speed"), "`quantity` must be one of"),
+        (lambda: plot.response(still(), coordinate=3), "`coordinate` must be at most 2, but is 3"),
+        (lambda: plot.response(still(), coordinate="x2"), "`coordinate` must be a whole number"),
+        (lambda: plot.energy.growth(None, None, (0.0, 1.0)), "must be a trajectory"),
+        (lambda: plot.energy.growth(still(), None, (0.0, 1.0), "work"), "`per_cycle` must be one of"),
     ],
 )
 def test_wrong_objects_are_refused_with_the_call_that_makes_right_ones(call, sentence):
