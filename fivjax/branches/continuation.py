@@ -23,7 +23,8 @@ from ..foundation import arguments
 from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
-from ..io.datasets import labelled
+from ..foundation.quantities import quantity_of
+from ..io.datasets import labelled, named
 from ..linear.linearisation import sliding_rates
 from ..model.contact_coordinates import to_contact_coordinates
 from ..model.directions import direction_of
@@ -262,7 +263,13 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
     if slopes is not None:
         of, values = slopes
         dataset = dataset.assign_coords(of=of).assign(d_special=(("point", "of"), values))
-    return dataset
+    return named(
+        dataset,
+        parameter=quantity_of(family.name) or (family.name, ""),
+        stable=("whether the cycle is stable", "1"),
+        state=("state on the section: displacements, then velocities", "m, m/s"),
+        direction=("direction of friction on the section, where it slides", "1"),
+    )
 
 
 def word_of(phases: Phases) -> str:

@@ -10,7 +10,7 @@ from ..cycles.search import attractors_met
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
-from ..io.datasets import labelled
+from ..io.datasets import labelled, named
 from ..model.scene import Scene
 from ..section.return_maps import ReturnMaps
 from .continuation import cycle_at
@@ -82,7 +82,11 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
             "rotation_number": ("point", rotation),
         }
     )
-    return labelled(dataset, Scene.from_dataset(branch)).assign_attrs(parameter=branch.attrs["parameter"])
+    dataset = labelled(dataset, Scene.from_dataset(branch)).assign_attrs(parameter=branch.attrs["parameter"])
+    dataset["parameter"].attrs = dict(branch["parameter"].attrs)
+    return named(
+        dataset, place=("index of the point on the branch", "1"), kind=("kind of the attractor beside the cycle", "1")
+    )
 
 
 def turning(multipliers: np.ndarray) -> np.ndarray:

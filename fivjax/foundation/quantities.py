@@ -101,6 +101,18 @@ QUANTITIES = {
     "p_crit_error": ("error estimate of the critical perturbation", "1"),
     "only_crossing": ("whether no other crossing was seen above the first", "1"),
     "crossings": ("number of verdict changes seen over the range of p", "1"),
+    "d_p_crit": ("derivative of the critical perturbation, per unit of the parameter", "1"),
+    "why_none": ("why there is no critical perturbation, or no derivative", "1"),
+    "newton_trajectories": ("trajectories that Newton's method took", "1"),
+    "period": ("period of the cycle", "s"),
+    "multipliers": ("multipliers of the return map, largest first", "1"),
+    "word": ("contact modes of the cycle, in order", "1"),
+    "special": ("what the point is on the branch, if it is special", "1"),
+    "d_special": ("derivative of the special point's parameter, per unit of the other", "1"),
+    "sliding_stable": ("whether steady sliding is stable", "1"),
+    "rotation_number": ("turns about the torus per crossing", "1"),
+    "manifold": ("place of the stable manifold along the unstable direction, relative to the saddle's size", "1"),
+    "path": ("crossings of the two kicks beside the critical one, relative to the saddle's size", "1"),
 }
 
 

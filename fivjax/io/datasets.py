@@ -38,6 +38,13 @@ def label(variable: "xr.DataArray") -> "xr.DataArray":
     return variable
 
 
+def named(dataset: "xr.Dataset", **meanings: tuple[str, str]) -> "xr.Dataset":
+    """The dataset with these long names and units of variables whose names mean something else elsewhere."""
+    for name, known in meanings.items():
+        dataset[name].attrs.update(zip(("long_name", "units"), known, strict=True))
+    return dataset
+
+
 def unit_of(name: str) -> str:
     """The unit of a parameter or result; "" for one that fivjax does not name."""
     known = quantity_of(name)

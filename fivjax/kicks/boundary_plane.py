@@ -15,7 +15,7 @@ from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
-from ..io.datasets import labelled
+from ..io.datasets import labelled, named
 from ..maps.basin_map import verdicts_from
 from ..model.directions import directions_of
 from ..model.load import Pulse
@@ -109,7 +109,14 @@ def boundary_section(
         },
         coords={"stable": axis, "unstable": axis, "side": ["slides", "squeals"], "direction": ["unstable", "stable"]},
     )
-    return labelled(dataset, scene).assign_attrs(p_crit=critical.p, multiplier=saddle.multiplier)
+    dataset = named(
+        labelled(dataset, scene),
+        stable=("distance from the saddle along its slowest stable direction, relative to its size", "1"),
+        unstable=("distance from the saddle along its unstable direction, relative to its size", "1"),
+        side=("what becomes of the kick", "1"),
+        direction=("direction of a coordinate of the path", "1"),
+    )
+    return dataset.assign_attrs(p_crit=critical.p, multiplier=saddle.multiplier)
 
 
 def _directions(saddle: Saddle, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

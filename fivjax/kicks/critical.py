@@ -10,8 +10,8 @@ from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
-from ..io.datasets import check_axis_names, labelled
-from ..maps.axes import check_run, check_size, checked_axes, linear_limit
+from ..io.datasets import check_axis_names, labelled, named
+from ..maps.axes import at_middle, check_run, check_size, checked_axes, linear_limit
 from ..maps.crossing import FirstCrossing
 from ..maps.datasets import time_limit
 from ..maps.engine import RunOptions
@@ -126,7 +126,7 @@ def critical_perturbation(
         name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
     }
     options = RunOptions("scan", memory, progress, executor, all_or_none=True)
-    kicked = Kicked(scene, columns, method, Limits(t_max), options, {})
+    kicked = Kicked(at_middle(scene, axes), columns, method, Limits(t_max), options, {})
     scan = Scan.of(kicked, np.linspace(low, high, scanned))
     # Newton's method mostly finds the kick from what one round leaves.
     fine, contradicted = kicked.narrowed(*scan.brackets, tolerance, 1 if derivatives else None)
@@ -158,9 +158,9 @@ def critical_perturbation(
     dataset = _over_axes(axes, found, scene)
     dataset.attrs.update(linear_limit(scene, axes))
     dataset.attrs["range"] = json.dumps([float(low), float(high)])
-    return labelled(
-        dataset, scene, method=describe_method(method), **time_limit(t_max), tolerance=tolerance, p_step=p_step
-    )
+    settings = {"method": describe_method(method), **time_limit(t_max), "tolerance": tolerance, "p_step": p_step}
+    dataset = labelled(dataset, scene, **settings)
+    return named(dataset, kind=("where the critical kick leads", "1")) if derivatives else dataset
 
 
 def _stepping_error(

@@ -1,7 +1,7 @@
 """Axes and arguments of maps and critical kicks, checked; and the critical friction that their datasets note."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -26,7 +26,18 @@ def linear_limit(scene: Scene, axes: Mapping[str, np.ndarray]) -> dict[str, floa
 
 
 # Names of maps' results beside those of each trajectory.
-OF_RESULTS = ("attractors", "attractor", "proof", "chaotic", "contact_events", "computed", "p_crit")
+OF_RESULTS = (
+    *("attractors", "attractor", "attractor_amplitude", "proof", "chaotic", "contact_events"),
+    *("computed", "point", "place", "step", "p_crit", "p_crit_low", "p_crit_high"),
+)
+
+
+def at_middle(scene: Scene, axes: Mapping[str, np.ndarray]) -> Scene:
+    """The scene with the middle values of its structure's parameters that are on axes: the section measures the states of all
+    groups alike, by this structure, whatever values the scene had of its own.
+    """
+    on_axes = {name: values[len(values) // 2] for name, values in axes.items() if name in scene.structure.parameters}
+    return scene.replace(**on_axes) if on_axes else scene
 
 
 def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
@@ -37,10 +48,14 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
         raise ValueError(f"Unknown axis `{unknown[0]}`; this scene has: {', '.join(sorted(scene.parameters))}.{hint}")
     # Names may be NumPy's strings, such as those of a dataset's coordinates.
     checked = {str(name): arguments.axis(name, values) for name, values in axes.items()}
-    taken = {*by_name(not_run(1, True)), *OF_RESULTS}
-    check_axis_names(checked, taken, "maps")
+    check_names(checked)
     check_corners(scene, checked)
     return checked
+
+
+def check_names(names: Iterable[str], *more: str) -> None:
+    """Refuse axes that are called like a map's result, or one of `more`."""
+    check_axis_names(names, {*by_name(not_run(1, True)), *OF_RESULTS, *more}, "maps")
 
 
 def check_size(axes: Mapping, halvings: int = 0, energy: bool = False, sparse: bool = False) -> None:

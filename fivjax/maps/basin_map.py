@@ -18,13 +18,16 @@ from ..model.structure import Structure
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
-from .axes import check_run, check_size, checked_axes, linear_limit
+from .axes import at_middle, check_names, check_run, check_size, checked_axes, linear_limit
 from .datasets import map_dataset, wilson
 from .engine import RunOptions, run_to_verdict
 from .executors import with_workers
 from .groups import Limits, kick_of
 from .plan import Grid, TrajectoryList
 from .resuming import keeper_at
+
+# The share of each basin, and its interval.
+SHARES = ("share", "share_low", "share_high")
 
 
 def state_places(structure: Structure) -> dict[str, int]:
@@ -106,13 +109,18 @@ def basins(
         raise ValueError(f"A map of basins needs at least one displacement or velocity as its axis: {names}.")
     check_size(axes)
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
+    check_names(axes, *SHARES, *(f"sliding_{share}" for share in SHARES))
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
     grid = Grid(axes, states, kick_of(scene))
     _check_gap(scene, axes)
     keeper = keeper_at(resume, scene, method, grid, {"t_max": t_max, "kick": bool(kick)})
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         verdicts = run_to_verdict(
-            scene, grid, method, Limits(t_max), RunOptions("basins", memory, progress, executor, keeper)
+            at_middle(scene, parameters),
+            grid,
+            method,
+            Limits(t_max),
+            RunOptions("basins", memory, progress, executor, keeper),
         )
     dataset = map_dataset(scene, method, t_max, grid, verdicts, linear_limit(scene, axes))
     for name, place in states.items():
@@ -161,7 +169,7 @@ def _with_shares(dataset: xr.Dataset) -> xr.Dataset:
     reached = np.bincount(dataset["attractor"].values.ravel() + 1, minlength=dataset.sizes["attractors"] + 1)[1:]
     shares = np.stack(wilson(reached, total))
     sliding = np.stack(wilson(np.sum(dataset["verdict"].values == Verdict.SLIDING), total))
-    for name, of_attractors, of_sliding in zip(("share", "share_low", "share_high"), shares, sliding, strict=True):
+    for name, of_attractors, of_sliding in zip(SHARES, shares, sliding, strict=True):
         dataset[name] = ("attractors", of_attractors, {"long_name": "share of the initial states", "units": "1"})
         dataset[f"sliding_{name}"] = ((), of_sliding, {"long_name": "share of states that slide", "units": "1"})
     return dataset

@@ -15,7 +15,7 @@ from ..foundation.stopping import stop_requests
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
-from .axes import check_run, check_size, checked_axes, linear_limit
+from .axes import at_middle, check_run, check_size, checked_axes, linear_limit
 from .datasets import audit_note, map_dataset
 from .engine import RunOptions, interrupted, run_to_verdict
 from .executors import with_workers
@@ -125,7 +125,9 @@ def bistability_map(
             "Argument `sparse` is for maps that are refined: give `refine`, how often to halve the intervals."
         )
     check_size(axes, refine, bool(energy), bool(sparse))
-    axes = {name: finer_axis(values, refine) for name, values in checked_axes(scene, axes).items()}
+    axes = checked_axes(scene, axes)
+    followed = at_middle(scene, axes)
+    axes = {name: finer_axis(values, refine) for name, values in axes.items()}
     grid = Grid(axes, of_kick=kick_of(scene))
     limits = Limits(t_max, int(max_steps), bool(energy))
     refinement = {"refine": int(refine), "audit": float(audit)} if refine else {}
@@ -138,7 +140,7 @@ def bistability_map(
         limit = aside.submit(linear_limit, scene, axes)
         aside.shutdown(wait=False)
         if not refine:
-            verdicts = run_to_verdict(scene, grid, method, limits, options)
+            verdicts = run_to_verdict(followed, grid, method, limits, options)
             return map_dataset(scene, method, t_max, grid, verdicts, _known_by_now(limit, verdicts))
         found: dict = {}  # attractors, which finer levels need not find again
 
@@ -146,7 +148,7 @@ def bistability_map(
             if requested:
                 # Since the last trajectory of the level before had ended.
                 return interrupted(not_run(len(places), limits.energy))
-            return run_to_verdict(scene, grid, method, limits, options._replace(label=f"map, {what}"), places, found)
+            return run_to_verdict(followed, grid, method, limits, options._replace(label=f"map, {what}"), places, found)
 
         with stop_requests() as requested:
             refined, verdicts, checked = refine_grid(grid.shape, refine, audit, level)

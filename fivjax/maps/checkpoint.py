@@ -26,14 +26,14 @@ from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.datasets import netcdf_of
 from ..io.files import check_writable, replace_whole
 from ..verdicts.verdict import Verdict
-from .job_files import attractors_from_bytes, attractors_to_bytes, file_of, runs_of
+from .job_files import SHARE_OF_TIME, attractors_from_bytes, attractors_to_bytes, file_of, runs_of
 from .plan import Indices
 from .results import Verdicts, by_name, not_run
 from .run_lock import RunLock
 
 KIND = "fivjax checkpoint"
-# Time between writes, s, and in times of what the latest took: long enough to cost nothing, short enough to lose little.
-KEEP_EVERY, SHARE_OF_TIME = 2.0, 20.0
+# Time between writes, s: long enough to cost nothing, short enough to lose little.
+KEEP_EVERY = 2.0
 # The name of the trajectories' indices.
 PLACE = "place"
 # The last bytes of the file, after the length of the list.

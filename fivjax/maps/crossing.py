@@ -26,15 +26,16 @@ def with_ends(inner: np.ndarray) -> np.ndarray:
     return np.concatenate([ends[:, :1], inner, ends[:, 1:]], axis=1)
 
 
-def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> FirstCrossing:
+def first_crossings(kicks: np.ndarray, verdicts: np.ndarray, computed: np.ndarray | bool = True) -> FirstCrossing:
     """The first crossing of each row of `verdicts` (rows, kicks) at `kicks` (one row for all, or one for each).
 
-    If already the first kick of a row ends on the limit cycle, that kick is `high` and the middle.
+    If already the first kick of a row ends on the limit cycle, that kick is `high` and the middle. Verdicts that were not
+    `computed`, but taken from a neighbour, prove nothing: `low` and `high` are others.
     """
-    kicks = np.broadcast_to(kicks, verdicts.shape)
+    kicks, computed = np.broadcast_to(kicks, verdicts.shape), np.broadcast_to(computed, verdicts.shape)
     low, high, middle = (np.full(len(verdicts), np.nan) for _ in range(3))
     changes = np.zeros(len(verdicts), int)
-    for row, (p, verdict) in enumerate(zip(kicks, verdicts, strict=True)):
+    for row, (p, verdict, known) in enumerate(zip(kicks, verdicts, computed, strict=True)):
         decided = np.flatnonzero((verdict == Verdict.SLIDING) | (verdict == Verdict.LIMIT_CYCLE))
         if len(decided) == 0:
             continue
@@ -43,10 +44,15 @@ def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> FirstCrossing:
         changes[row] = len(flips)
         upward = flips[found[flips] == Verdict.SLIDING]
         if found[0] == Verdict.LIMIT_CYCLE:
-            high[row] = p[decided[0]]
-            middle[row] = p[0] if decided[0] == 0 else np.nan
+            above = decided[0]
+            middle[row] = p[0] if above == 0 else np.nan
         elif len(upward):
             below, above = decided[upward[0]], decided[upward[0] + 1]
-            low[row], high[row] = p[below], p[above]
-            middle[row] = 0.5 * (low[row] + high[row]) if above == below + 1 else np.nan
+            slides = np.flatnonzero(known[: below + 1] & (verdict[: below + 1] == Verdict.SLIDING))
+            low[row] = p[slides[-1]] if len(slides) else np.nan
+            middle[row] = 0.5 * (p[below] + p[above]) if above == below + 1 else np.nan
+        else:
+            continue
+        squeals = above + np.flatnonzero(known[above:] & (verdict[above:] == Verdict.LIMIT_CYCLE))
+        high[row] = p[squeals[0]] if len(squeals) else np.nan
     return FirstCrossing(low, high, middle, changes)

@@ -107,8 +107,12 @@ def with_critical_kicks(dataset: xr.Dataset) -> xr.Dataset:
     if "p" not in dataset.dims:
         return dataset
     others, p = tuple(name for name in dataset["verdict"].dims if name != "p"), dataset["p"].values
-    rows = dataset["verdict"].transpose(*others, "p").values.reshape(-1, len(p))
-    crossing, over = first_crossings(p, rows), [dataset.sizes[name] for name in others]
+
+    def by_kick(name: str) -> np.ndarray:
+        return dataset[name].transpose(*others, "p").values.reshape(-1, len(p))
+
+    computed = by_kick("computed") if "computed" in dataset else True
+    crossing, over = first_crossings(p, by_kick("verdict"), computed), [dataset.sizes[name] for name in others]
     found = {"p_crit": crossing.middle, "p_crit_low": crossing.low, "p_crit_high": crossing.high}
     return dataset.assign(
         {name: label(xr.DataArray(values.reshape(over), dims=others, name=name)) for name, values in found.items()}

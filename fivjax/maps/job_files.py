@@ -97,6 +97,8 @@ class JobState(NamedTuple):
 
 # Time between writes, s.
 KEEP_EVERY = 4.0
+# And in times of what the latest took, where that is longer.
+SHARE_OF_TIME = 20.0
 
 
 class JobFile:
@@ -107,7 +109,7 @@ class JobFile:
 
     def __init__(self, path: str | None, key: str):
         self.path, self.key = None if path is None else Path(path), key
-        self._written, self._noted = time.monotonic(), None
+        self._written, self._took, self._noted = time.monotonic(), 0.0, None
 
     def last(self) -> JobState | None:
         """The state in which an interrupted run of the job was kept, if there is one."""
@@ -124,7 +126,7 @@ class JobFile:
         `moving`, its arrays do not change.
         """
         self._noted = now
-        if time.monotonic() - self._written >= (0.25 if at_once else 1.0) * KEEP_EVERY:
+        if time.monotonic() - self._written >= max((0.25 if at_once else 1.0) * KEEP_EVERY, SHARE_OF_TIME * self._took):
             self.flush()
 
     def moving(self) -> None:
@@ -136,10 +138,12 @@ class JobFile:
         noted, self._noted = self._noted, None
         if noted is None or self.path is None:
             return
+        begun = time.monotonic()
         with contextlib.suppress(OSError):
             self.path.parent.mkdir(exist_ok=True)
             replace_whole(self.path, sealed(state_to_bytes(noted, self.key)))
         self._written = time.monotonic()
+        self._took = self._written - begun
 
 
 def state_to_bytes(now: JobState, key: str) -> bytes:

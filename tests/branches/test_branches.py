@@ -54,6 +54,8 @@ def test_the_branch_passes_its_fold_and_names_what_happens_on_the_way(branch):
     np.testing.assert_allclose(branch.parameter.values[[0, -1]], 0.21, rtol=1e-14)
     fold = int(np.argmax(branch.special.values == "fold"))
     assert not branch.stable.values[:fold].any() and branch.stable.values[fold + 1 :].all()
+    assert branch["parameter"].attrs == {"long_name": "friction coefficient", "units": "1"}
+    assert all("long_name" in variable.attrs for variable in branch.data_vars.values())
     assert branch.word.values[0] == "stick – slide"
     assert branch.word.values[-1] == "stick – slide – detach – slide – slide back"
 

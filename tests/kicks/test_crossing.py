@@ -50,6 +50,15 @@ def test_a_crossing_is_the_bracket_that_is_proved(row, low, high, middle, change
     assert found.changes[0] == changes
 
 
+def test_what_was_not_computed_proves_nothing():
+    """A refined map whose points beside the crossing have their verdicts from neighbours."""
+    row, computed = np.array([0, 0, 0, 1, 1, 1]), np.array([True, True, False, False, True, False])
+    found = first_crossings(KICKS, row[None], computed[None])
+    assert [found.low[0], found.high[0]] == [1.1, 1.4] and found.middle[0] == pytest.approx(1.25)
+    found = first_crossings(KICKS, 0 * row[None] + 1, computed[None] & (KICKS > 1.0))
+    assert np.isnan(found.low[0]) and found.high[0] == 1.1
+
+
 def told(verdict_of):
     """In place of `run_to_verdict`: verdicts as a function of the kick and of the label of the batch."""
 

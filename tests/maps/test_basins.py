@@ -119,3 +119,12 @@ def test_a_lane_that_only_rebounds_has_no_other_event_and_comes_to_the_cycle_of_
         # Rebounds are no changes of the status.
         assert found.contact_events.item() == 0 and found.verdict.item() == fj.Verdict.LIMIT_CYCLE
         assert found.amplitude.item() == pytest.approx(1.146, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["verdict", "amplitude", "share", "sliding_share", "attractors"])
+def test_a_coordinate_called_like_a_result_is_refused_before_anything_is_computed(name):
+    matrices = fj.belt_oscillator().matrices
+    structure = fj.Structure(*matrices, tangential=0, normal=2, coordinates=(name, "y1", "y2"))
+    scene = fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.ConstantLoad(100.0))
+    with pytest.raises(ValueError, match=f"Axis `{name}` has the name of a result of maps"):
+        fj.basins(scene, **{name: [0.0, 1e-3]})

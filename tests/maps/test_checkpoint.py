@@ -88,6 +88,7 @@ def test_an_interrupted_job_goes_on_from_where_it_was(paper_scene, whole, tmp_pa
 
     monkeypatch.setattr(TrajectoryKernels, "follow", counting)
     monkeypatch.setattr(job_files, "KEEP_EVERY", 0.0)
+    monkeypatch.setattr(job_files, "SHARE_OF_TIME", 0.0)
     path, stop = tmp_path / "map.part", 0
     fj.bistability_map(paper_scene, progress=False, resume=tmp_path / "whole.part", **AXES)
     total, stop = len(made), calls
@@ -114,6 +115,7 @@ def test_what_is_left_of_another_maps_first_job_is_refused_and_stays(paper_scene
 
     monkeypatch.setattr(TrajectoryKernels, "follow", stopping)
     monkeypatch.setattr(job_files, "KEEP_EVERY", 0.0)
+    monkeypatch.setattr(job_files, "SHARE_OF_TIME", 0.0)
     path = tmp_path / "map.part"
     with pytest.warns(UserWarning, match="Interrupted"):
         fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)

@@ -237,3 +237,15 @@ def test_growth_of_one_contact_beside_a_quiet_one_is_followed_to_its_cycle():
     assert both.verdict[0] == one.verdict[0] == fj.Verdict.LIMIT_CYCLE
     assert float(both.amplitude[0]) == pytest.approx(float(one.amplitude[0]), rel=1e-6)
     assert both.decided_at[0] > 40.0
+
+
+def test_a_value_of_the_scene_that_is_on_an_axis_changes_no_bit_of_a_map():
+    """Neither verdicts nor attractors, nor when they are proved: by scenes that are wrong by orders of magnitude."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.2))
+    axes = {"k1": [99.5e3, 100e3], "p": [1.05, 1.2, 1.5, 2.0]}
+    whole = fj.bistability_map(scene, progress=False, **axes)
+    assert set(whole["verdict"].values.ravel().tolist()) == {0, 1}
+    for own in (1e2, 1e9):
+        other = fj.bistability_map(scene.replace(k1=own), progress=False, **axes)
+        for name, variable in whole.data_vars.items():
+            np.testing.assert_array_equal(other[name].values, variable.values, err_msg=str(name))
