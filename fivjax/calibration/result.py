@@ -121,7 +121,7 @@ class Calibration(eqx.Module):
         """A parameter with its uncertainty as text, or "not identifiable" and the like."""
         if not self.identifiable[name]:
             no_signal = self.outcome is FitOutcome.NO_SIGNAL
-            return "not identifiable" if self.converged or no_signal else "not told"
+            return "not identifiable" if self.converged or no_signal else "no value"
         deviation = self.uncertainty[name]
         return f"{self.values[name]:.6g} ± " + ("not known" if np.isnan(deviation) else f"{deviation:.2g}")
 
@@ -137,7 +137,7 @@ class Calibration(eqx.Module):
             said.append(f"  what is left: {self.left}")
         said += [f"  {name:<12}{self.value_text(name)}" for name in self.names]
         for group, correlation in self.combinations:
-            said.append(f"  {', '.join(group)}: told only in combination (correlation {correlation:.3f})")
+            said.append(f"  {', '.join(group)}: identifiable only in combination (correlation {correlation:.3f})")
         for k, offset in enumerate(self.offsets):
             if offset is not None:
                 error = f"{offset[1]:.2g}" if np.isfinite(offset[1]) else "not known"

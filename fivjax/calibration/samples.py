@@ -56,8 +56,9 @@ class Sampled(eqx.Module):
         return jnp.mean(jnp.fft.irfft(spectrum * response, self.count, axis=0)[self.picked], axis=1)
 
     def jumping(self, channels: tuple[Channel, ...], slopes: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Which channels' samples, or `slopes` of them, jump where an event moves past them: where accelerations jump, and
-        where velocities do."""
+        """Two masks over channels: whose samples (with `slopes`: whose rates of change) jump where an event passes that makes
+        accelerations jump, and where one passes that makes velocities jump.
+        """
         derivatives = np.array([channel.derivative for channel in channels]) - self.averages + slopes
         return (derivatives >= 2) & (not self.filtered), (derivatives >= 1) & (not self.filtered)
 

@@ -12,9 +12,10 @@ import tyro
 
 import fivjax as fj
 
+from ..foundation.digits import counted
 from .options import MethodOptions
 from .outputs import Failure, Interrupted, Overwrite, output_paths, write_data, write_picture
-from .parsing import axis, number
+from .parsing import axis
 from .structure_options import StructureOptions
 from .workers import workers_of
 
@@ -122,7 +123,7 @@ class Map:
         counts = {verdict: int((dataset["verdict"] == verdict).sum()) for verdict in fj.Verdict}
         for verdict, count in counts.items():
             if count:
-                print(f"  {number(count, 'trajectory', 'trajectories'):>20s}: {verdict.words}")
+                print(f"  {counted(count, 'trajectory', 'trajectories'):>20s}: {verdict.words}")
         if not any(counts[verdict] for verdict in fj.Verdict if verdict >= fj.Verdict.UNDECIDED):
             reasons = ", ".join(verdict.words for verdict, count in counts.items() if count)
             raise Failure(f"No trajectory of the map could be followed: {dataset.attrs.get('failure', reasons)}.")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from ..foundation.digits import apart
+from ..foundation.digits import apart, counted
 
 
 def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
@@ -24,7 +24,7 @@ def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
             f"An axis must read NAME=FROM:TO:COUNT, such as mu=0.05:0.228:64, but reads {text!r}."
         ) from None
     if points < least:
-        raise ValueError(f"Axis `{name}` must have at least {number(least, 'value')}, but its COUNT is {points}.")
+        raise ValueError(f"Axis `{name}` must have at least {counted(least, 'value')}, but its COUNT is {points}.")
     most_values = 10**7
     if points > most_values:
         raise ValueError(
@@ -121,8 +121,3 @@ def check_angle(what: str, angle: float) -> None:
             f"{what} is in rad and must be less than a right angle, {0.5 * math.pi:.4f}, but is {angle:g}; "
             f"{angle:g} degrees are {math.radians(angle):.4g} rad."
         )
-
-
-def number(count: int, one: str, several: str | None = None) -> str:
-    """A count with its noun: "1 trajectory", "2 trajectories"."""
-    return f"{count} {one if count == 1 else several or one + 's'}"

@@ -9,9 +9,9 @@ import tyro
 
 import fivjax as fj
 
+from ..foundation.digits import counted
 from .options import SceneOptions
 from .outputs import Overwrite, output_paths, refuse_existing, say, write_data, write_picture
-from .parsing import number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +79,6 @@ class Reproduce:
                 f"Folder `{self.out}` cannot be written into: {error.strerror}. Give another by `--out`."
             ) from error
         say(report)
-        what = number(len(made), "figure or table", "figures and tables")
+        what = counted(len(made), "figure or table", "figures and tables")
         print(f"  {what}, each as .png and .nc, in {time.perf_counter() - begin:.0f} s")
         print(f"  {made.summary} What differs is explained in the report.")

@@ -220,8 +220,8 @@ class LimitCycle(eqx.Module):
         captures = ""
         if self.reach is not None and self.contraction is not None:
             captures = (
-                f"; captures what comes within {100 * self.reach:.2g} % of that, where distances fall at least by the factor "
-                f"{self.contraction:.3g} a period"
+                f"; attracts what comes within {100 * self.reach:.2g} % of its size, where a period shrinks distances to "
+                f"{self.contraction:.3g} of themselves or less"
             )
         return (
             f"{head}\n  word: {modes}\n  sizes of the multipliers: {largest}\n"

@@ -14,3 +14,8 @@ def apart(*values: float, digits: int = ORDINARY) -> tuple[str, ...]:
         if len(set(texts)) >= len({number for number in numbers if number == number}):
             break
     return texts
+
+
+def counted(count: int, one: str, several: str | None = None) -> str:
+    """A count with its noun: "1 trajectory", "2 trajectories"."""
+    return f"{count} {one if count == 1 else several or one + 's'}"

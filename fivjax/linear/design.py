@@ -1,7 +1,4 @@
-"""Design by gradient: raise the critical friction, or lower growth rates, by changing parameters within bounds.
-
-The search for a critical friction by gradient, `search_critical_friction`, can be imported from here, too.
-"""
+"""Design by gradient: raise the critical friction, or lower growth rates, by changing parameters within bounds."""
 
 import enum
 from collections.abc import Callable, Mapping
@@ -19,9 +16,6 @@ from ..foundation.precision import in_double_precision, real
 from ..io.datasets import check_axis_names, labelled
 from ..model.structure import Structure
 from .critical import critical_friction
-from .gradient_search import BracketedNewton as BracketedNewton
-from .gradient_search import Search as Search
-from .gradient_search import search_critical_friction as search_critical_friction
 from .spectrum import growth_rate
 from .system import as_scene
 

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..foundation.digits import counted
+
 # Rounding in a file that prints some ten digits; an error is larger by far.
 ROUNDING = 1e-6
 # Eigenvalues below this share of the largest of the lowest ones computed are rigid-body modes.
@@ -77,17 +79,17 @@ class StructureChecks:
         for name, count in self.unexplained.items():
             if count > 0:
                 beside = ", beside one for each Lagrange multiplier" if name == "stiffness" and self.multipliers else ""
-                found.append(f"The {name} matrix has {_of(count, 'negative eigenvalue')}{beside}.")
+                found.append(f"The {name} matrix has {counted(count, 'negative eigenvalue')}{beside}.")
         if self.negative_masses == 0 and self.negative_springs == 0:
             found.append("Mass and stiffness have no negative eigenvalues.")
         found += self._about_rows
         massless = self.massless - len(self.multipliers) - len(self.loose)
         if massless > 0:
-            found.append(f"{_of(massless, 'degree of freedom', 'degrees of freedom')} without mass.".capitalize())
+            found.append(f"{counted(massless, 'degree of freedom', 'degrees of freedom')} without mass.".capitalize())
         if self.lowest_frequencies is not None:
             elastic = [f for f in self.lowest_frequencies if f > np.sqrt(RIGID) * max(self.lowest_frequencies)]
             first = f"; the first elastic one is at {elastic[0]:.6g} Hz" if elastic else ""
-            found.append(f"{_of(self.rigid_body_modes or 0, 'rigid-body mode')}{first}.")
+            found.append(f"{counted(self.rigid_body_modes or 0, 'rigid-body mode')}{first}.")
         elif self.symmetric:
             why = "rows without entries" if self.loose else "constraints that follow from others, perhaps"
             found.append(f"Rigid-body modes and frequencies are not known: the stiffness is singular ({why}).")
@@ -97,20 +99,21 @@ class StructureChecks:
             along = ", ".join(f"{mass:.6g} kg along {axis}" for mass, axis in zip(self.total_mass, "xyz", strict=True))
             found.append(f"Total mass: {along}.")
         if self.fixed:
-            found.append(f"{_of(self.fixed, 'held degree of freedom', 'held degrees of freedom')} left out.")
+            found.append(f"{counted(self.fixed, 'held degree of freedom', 'held degrees of freedom')} left out.")
         return [*found, *self.remarks]
 
     @property
     def _about_rows(self) -> list[str]:
         found = []
         if self.internal:
+            rows = counted(len(self.internal), "row")
             found.append(
-                f"{_of(len(self.internal), 'row')} of internal nodes, which have negative numbers ({_listing(self.internal)}): "
+                f"{rows} of internal nodes, which have negative numbers ({_listing(self.internal)}): "
                 f"unknowns that elements or constraints have of their own."
             )
         if self.multipliers:
             found.append(
-                f"{_of(len(self.multipliers), 'Lagrange multiplier')} without mass and stiffness "
+                f"{counted(len(self.multipliers), 'Lagrange multiplier')} without mass and stiffness "
                 f"({_listing(self.multipliers)}). Each holds a constraint, such as a tie or a contact, and makes one "
                 f"eigenvalue of the stiffness negative, which is no instability. `fj.craig_bampton` and `fj.cea.complex_modes` "
                 f"keep the constraints. For matrices without multipliers, export the model with penalty stiffness in their "
@@ -118,14 +121,10 @@ class StructureChecks:
             )
         if self.loose:
             found.append(
-                f"{_of(len(self.loose), 'row')} with neither mass nor stiffness ({_listing(self.loose)}). Hold such degrees of "
-                f"freedom in the finite-element model, or leave them out."
+                f"{counted(len(self.loose), 'row')} with neither mass nor stiffness ({_listing(self.loose)}). Hold such "
+                f"degrees of freedom in the finite-element model, or leave them out."
             )
         return found
-
-
-def _of(count: int, one: str, many: str = "") -> str:
-    return f"{count} {one if count == 1 else many or one + 's'}"
 
 
 def _listing(rows: tuple[str, ...]) -> str:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.linear import cea, design
+from fivjax import design
+from fivjax.linear import cea
 from fivjax.linear.design import DesignOutcome
 from fivjax.linear.outcomes import StabilityOutcome
 from fivjax.plot import linear as plot_linear
