@@ -15,7 +15,7 @@ import numpy as np
 
 from ..attractors.closing import closed_at
 from ..contact import Contact, Status
-from ..cycles.cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_load
+from ..cycles.cycle import LimitCycle, limit_cycle_of, point_of, stability_margin, under_final_load
 from ..cycles.own_coordinates import cycle_in_own_coordinates, in_own_coordinates
 from ..cycles.saddle import saddle_cycle
 from ..cycles.search import NoLimitCycle, limit_cycle
@@ -250,7 +250,7 @@ def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
             "period": ("point", [point.cycle.phases.period for point in points]),
             "amplitude": ("point", peaks),
             "multipliers": (("point", "multiplier"), multipliers),
-            "stable": ("point", largest < 1 - MARGIN),
+            "stable": ("point", largest < 1 - stability_margin(count)),
             "sliding_stable": ("point", slides),
             "word": ("point", [word_of(point.cycle.phases) for point in points]),
             "special": ("point", [point.name for point in points]),

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..attractors.cycles import CROSSINGS, MOST_CROSSINGS
 from ..contact import Status
 from ..cycles.one_period import PeriodSummary, follow_period
 from ..model.scene import Scene
@@ -103,10 +104,12 @@ def _states(scene: Scene, phases: Phases, looks: Iterable[int]) -> list[Point]:
 
 def crossings_of(maps: ReturnMaps, point: Point) -> int | None:
     """How often a cycle crosses the section until it returns to the given point; None if it does not return."""
-    # The most crossings of the section in one period.
-    most_crossings = 24
     y = maps.weights * np.asarray(point.y)
-    _, path = maps.path(np.zeros(1, int), Section.of(point), most_crossings)
-    with np.errstate(invalid="ignore"):
-        back = np.flatnonzero(np.linalg.norm(maps.weights * path[0] - y, axis=1) <= BACK * np.linalg.norm(y))
-    return int(back[0]) + 1 if len(back) else None
+    # Most cycles have few.
+    for most in (CROSSINGS, MOST_CROSSINGS):
+        _, path = maps.path(np.zeros(1, int), Section.of(point), most)
+        with np.errstate(invalid="ignore"):
+            back = np.flatnonzero(np.linalg.norm(maps.weights * path[0] - y, axis=1) <= BACK * np.linalg.norm(y))
+        if len(back):
+            return int(back[0]) + 1
+    return None

@@ -265,7 +265,7 @@ def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitC
         contact=Contact(np.asarray(point.contact.status), np.asarray(point.contact.direction)),
         word=word(seen.segments),
         multipliers=floquet_multipliers(scene, seen.segments, closed.period),
-        stable=bool(largest < 1 - (MARGIN if np.ndim(point.contact.status) == 0 else FAMILY_TOLERANCE)),
+        stable=bool(largest < 1 - stability_margin(np.size(point.contact.status))),
         amplitude=float(seen.amplitude),
         residual=closed.residual,
         crossings=closed.crossings,
@@ -273,6 +273,11 @@ def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitC
         points=points,
         return_jacobian=closed.jacobian,
     )
+
+
+def stability_margin(contacts: int) -> float:
+    """By how much multipliers of a stable cycle are smaller than 1: with several contacts it may be one of a family."""
+    return MARGIN if contacts == 1 else FAMILY_TOLERANCE
 
 
 @in_double_precision

@@ -33,10 +33,10 @@ OF_RESULTS = (
 
 
 def at_middle(scene: Scene, axes: Mapping[str, np.ndarray]) -> Scene:
-    """The scene with the middle values of its structure's parameters that are on axes: the section measures the states of all
-    groups alike, by this structure, whatever values the scene had of its own.
+    """The scene with the middle values of its parameters that are on axes: the section measures the states of all groups alike,
+    by this structure, whatever values the scene had of its own.
     """
-    on_axes = {name: values[len(values) // 2] for name, values in axes.items() if name in scene.structure.parameters}
+    on_axes = {name: values[len(values) // 2] for name, values in axes.items() if name in scene.parameters}
     return scene.replace(**on_axes) if on_axes else scene
 
 

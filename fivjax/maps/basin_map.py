@@ -12,7 +12,7 @@ from ..cycles.cycle import under_final_load
 from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
-from ..model.scene import Scene, sliding_equilibrium
+from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
 from ..steppers.base import AbstractStepper
@@ -112,7 +112,7 @@ def basins(
     check_names(axes, *SHARES, *(f"sliding_{share}" for share in SHARES))
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
     grid = Grid(axes, states, kick_of(scene))
-    _check_gap(scene, axes)
+    _check_gap(scene.structure, axes)
     keeper = keeper_at(resume, scene, method, grid, {"t_max": t_max, "kick": bool(kick)})
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         verdicts = run_to_verdict(
@@ -148,12 +148,11 @@ def _states_among(scene: Scene, axes: dict) -> dict[str, int]:
     return {name: known[name] for name in axes if name in known}
 
 
-def _check_gap(scene: Scene, axes: dict[str, np.ndarray]) -> None:
-    equilibrium = sliding_equilibrium(scene)
-    for place in np.atleast_1d(contact_coordinates(scene.structure)[1]):
-        name = scene.structure.coordinates[place]
-        gap = axes.get(name, np.array([float(equilibrium[place])]))
-        rate = axes.get(f"d{name}", np.zeros(1))
+def _check_gap(structure: Structure, axes: dict[str, np.ndarray]) -> None:
+    for place in np.atleast_1d(contact_coordinates(structure)[1]):
+        name = structure.coordinates[place]
+        # Steady sliding is in contact.
+        gap, rate = axes.get(name, np.zeros(1)), axes.get(f"d{name}", np.zeros(1))
         if gap[0] < 0:
             raise ValueError(f"Axis `{name}` must not go below the belt, but holds {gap[0]:g} m.")
         if gap[0] == 0 and rate[0] < 0:

@@ -12,6 +12,7 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper, describe_method
 from ..verdicts.sliding_proof import why_withheld
 from ..verdicts.verdict import FAILURES, MEANING, RESTS_ON, Proof, Verdict
+from .axes import at_middle
 from .crossing import first_crossings
 from .groups import kernels_by
 from .plan import Grid
@@ -85,7 +86,7 @@ def map_dataset(
         dataset = with_critical_kicks(dataset)
     labelled(dataset, scene, method=describe_method(method), **time_limit(t_max))
     dataset.attrs.update(kernels_by(method, scene))
-    _explain(dataset, why_withheld(scene))
+    _explain(dataset, why_withheld(at_middle(scene, grid.axes)))
     dataset.attrs.update(linear)
     every = dataset["verdict"].values
     first = Verdict(int(every.flat[0]))

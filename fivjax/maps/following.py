@@ -24,6 +24,7 @@ from ..simulation.ending import UNBOUNDED_FROM
 from ..verdicts.sliding_proof import SlidingModes, margin_share_bound
 from .groups import GroupConstants, Task, constants_of, kick_of
 from .one_trajectory import (
+    NOTHING,
     Progress,
     TaskConstants,
     conclude,
@@ -119,14 +120,15 @@ def _may_be_concluded(
 ) -> np.ndarray:
     """Which trajectories (leading axis) may have a verdict by `conclude`, or may be taken to their next event, after a round of
     steps: those whose mode has not changed in it, or not for half a period, after the last jump of the load, and those that
-    have not moved, are too large or are not finite. Cheap. `began` and `events` are the time (s) and the number of events
-    before the round.
+    have not moved, have come to rest, are too large or are not finite. Cheap. `began` and `events` are the time (s) and the
+    number of events before the round.
     """
     largest = np.max(np.abs(shared.weights[group] * now.y), axis=1)
     # While its mode changes again and again, nothing can be proved of a trajectory.
     since = now.t - np.maximum(now.last_event, now.last_jump)
     calm = (now.events == events) | (since >= 0.5 * np.asarray(shared.modes.slowest_period)[group])
-    return ((now.last_jump <= now.t) & calm) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * now.yardstick)
+    rests = (now.t <= began) | (largest < NOTHING * now.yardstick)
+    return ((now.last_jump <= now.t) & calm) | rests | ~(largest <= UNBOUNDED_FROM * now.yardstick)
 
 
 def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.ndarray, " m"]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, State
-from ..model.load import AbstractLoad, next_jump
+from ..model.load import AbstractLoad, load_from, next_jump
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
 from ..simulation.ending import UNBOUNDED_FROM
@@ -24,6 +24,9 @@ from ..verdicts.slow_growth import slide_while_certain
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
 from .groups import GroupConstants, Task, kick_of, with_values
+
+# Motions of this size, relative to what made them, change no digit of what a jump of the load makes of them.
+NOTHING = float(np.finfo(float).eps) ** 2
 
 
 class Progress(eqx.Module):
@@ -201,9 +204,11 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
             setting.shared.drift, mechanics.of_totals, now.contact, now.y + modes.linear.equilibrium
         )
     quiet_load = now.last_jump <= now.t
-    # A motion of less than can be computed with all digits has come to rest: nothing happens any more.
-    limits = jnp.finfo(now.y.dtype)
-    rests = quiet_load & (largest < float(limits.tiny) / float(limits.eps))
+    # Under the final load a motion of less than can be computed with all digits has come to rest: nothing happens before the
+    # load jumps. One that fades has done so when it is nothing beside what the jump will make.
+    least = float(jnp.finfo(now.y.dtype).tiny / jnp.finfo(now.y.dtype).eps)
+    fades = jnp.where(~quiet_load & modes.stable, NOTHING * now.yardstick, 0.0)
+    rests = (largest < jnp.maximum(least, fades)) & (load_from(scene.load, now.t) == scene.load.final)
     bound = margin_share_bound(mechanics, modes, now.contact, now.y, quiet_load)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(now.y)),
@@ -218,8 +223,9 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
             ),
         ),
     )
-    t = jnp.where(rests & (verdict == Verdict.UNDECIDED), jnp.inf, now.t)
-    now = eqx.tree_at(lambda now: (now.t, now.verdict, now.bound), now, (t, verdict.astype(jnp.int8), bound))
+    rests = rests & (verdict == Verdict.UNDECIDED)
+    t, y = jnp.where(rests, next_jump(scene.load, now.t), now.t), jnp.where(rests, 0.0, now.y)
+    now = eqx.tree_at(lambda now: (now.t, now.y, now.verdict, now.bound), now, (t, y, verdict.astype(jnp.int8), bound))
     return _with_sliding(setting, now, quiet_load) if _may_slide_on(setting, now) else now
 
 

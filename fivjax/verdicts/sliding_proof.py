@@ -85,9 +85,9 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     vectors = np.take_along_axis(vectors, order[:, None, :], axis=2)[:, :, :kept]
     count = np.where(eigenvalues.imag > 0, 2.0, np.where(eigenvalues.imag == 0, 1.0, 0.0))
     from_modal = np.einsum("gk,gmk->gmk", count, vectors)
-    # By more than the rounding errors of real parts.
-    least = 64 * np.finfo(float).eps * np.max(np.abs(eigenvalues), axis=-1, keepdims=True)
-    decays = np.all(eigenvalues.real < -least, axis=-1)
+    # By more than the rounding errors of real parts, which are the larger the closer modes are to coalescing.
+    rounding = 4 * matrix.shape[-1] * np.finfo(float).eps * np.minimum(condition, 1e9)
+    decays = np.max(eigenvalues.real, axis=-1) < -rounding * np.max(np.abs(eigenvalues), axis=-1)
     return SlidingModes(
         linear=linear,
         eigenvalues=eigenvalues,

@@ -1,13 +1,14 @@
 """Branches of limit cycles against closed forms, against ODE solvers of another kind, and against trajectories."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.branches import pseudo_arclength
+from fivjax.branches import pseudo_arclength, verification
 from fivjax.branches.special_points import pairing
 from fivjax.model import own_structures
 from tests.helpers import oracle, reference
@@ -628,3 +629,20 @@ def test_where_a_lift_off_begins_does_not_depend_on_restitution(restitution):
         for branch in branches
     ]
     assert mu[1] == pytest.approx(mu[0], rel=1e-11) and mu[0] == pytest.approx(0.182125040747, rel=1e-10)
+
+
+def test_cycles_of_many_crossings_are_given_back(monkeypatch):
+    """Of a return map that comes back after 27 crossings; the motion itself takes part in nothing else here."""
+    seen = []
+
+    class Turning:
+        weights = np.ones(2)
+
+        def path(self, group, at, count):
+            seen.append(count)
+            angle = 2 * np.pi * np.arange(1, count + 1) / 27
+            return at, np.stack([np.cos(angle), np.sin(angle)], axis=-1)[None]
+
+    monkeypatch.setattr(verification.Section, "of", lambda *points: None)
+    assert verification.crossings_of(Turning(), SimpleNamespace(y=np.array([1.0, 0.0]))) == 27
+    assert seen == [8, 512]

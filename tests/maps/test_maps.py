@@ -428,3 +428,18 @@ def test_on_a_slow_belt_a_cycle_is_looked_for_though_its_events_are_rare():
     np.testing.assert_array_equal(m["verdict"], fj.Verdict.LIMIT_CYCLE)
     np.testing.assert_allclose(m["amplitude"], cycle.amplitude, rtol=1e-9)
     np.testing.assert_allclose(m["attractor_period"], cycle.period, rtol=1e-9)
+
+
+@pytest.mark.parametrize("damping", [1.0, 50.0])
+def test_the_wait_before_a_kick_changes_no_verdict(damping):
+    """Within it the rounding of the start fades: to where numbers lose their digits, and on."""
+    scene = fj.Scene(fj.belt_oscillator(c1=damping, c2=damping), fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.2))
+    m = fj.bistability_map(scene, start=[0.0, 40.0, 5000.0], p=[1.05, 1.5, 3.0], progress=False)
+    for name in ("verdict", "amplitude"):
+        np.testing.assert_array_equal(m[name].values, np.tile(m[name].values[:1], (3, 1)), err_msg=name)
+    assert np.all(m["verdict"] >= 0) and np.any(m["verdict"] == 1) == (damping == 1.0)
+    waited = m["start"].values[:, None]
+    assert np.all(m["decided_at"] >= waited)
+    # The time from the kick to the last event is that of the motion, not of steps.
+    last = (m["last_event"] - waited).values[m["verdict"].values == 0].reshape(3, -1)
+    np.testing.assert_allclose(last, np.tile(last[:1], (3, 1)), rtol=1e-6)
