@@ -5,8 +5,8 @@ Groups of a map lie close together. So a few of them are searched by releases, a
 nothing can be continued, motions are released there, too. What else a group may have is found by trajectories that nothing
 captures. The limit cycles of one scene are those of a group of one.
 
-What is found of a group depends on its parameters and on those of the group that seeds it: on no trajectory of the map, nor on
-their number, nor on who is in the same job.
+What is found of a group depends on its parameters, on those of the group that seeds it, and on the structure by which the map
+measures states (`maps.axes.at_middle`): on no trajectory of the map, nor on their number, nor on who is in the same job.
 """
 
 from collections.abc import Callable
