@@ -68,6 +68,9 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
         if isinstance(error, OSError):
             print(f"fivjax: What is needed on disk could not be written: {error}.", file=sys.stderr)
             return 1
+        if isinstance(error, ImportError) and error.name is None:  # a sentence that says what to install
+            print(f"fivjax: {error}", file=sys.stderr)
+            return 2
         if isinstance(error, ValueError | TypeError | Failure):
             print(f"fivjax: {error}", file=sys.stderr)
             return 1 if isinstance(error, Failure) else 2

@@ -140,14 +140,14 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
 
 
 def _kicked(scene: Scene) -> list[Trajectory]:
-    """The scene's motion under its load, up to the end of the pulse; of several strengths."""
+    """The scene's motion in a pulse like its own, up to its end; of several strengths. Before it the scene slides."""
     # Strengths of pulses, in final loads, from whose ends motions are followed if all cycles are asked for.
     kicks = (0.0, 0.9, 1.2, 1.6, 2.2, 3.0, 4.5, 6.0)
     if not isinstance(scene.load, Pulse) or float(scene.load.duration) <= 0:
         return []
     # Steps end there: a row at a jump of the load is the state that the kick has left behind.
-    end = float(scene.load.start + scene.load.duration)
-    return [simulate(scene.replace(p=float(p)), end, end, derivatives="none") for p in kicks]
+    end, pulse = float(scene.load.duration), scene.replace(start=0.0)
+    return [simulate(pulse.replace(p=float(p)), end, end, derivatives="none") for p in kicks]
 
 
 class Met(NamedTuple):

@@ -219,6 +219,7 @@ def _digest(function: Callable, given: tuple) -> str:
         str(len(jax.devices())),
         _processor(),
         str(jax.config.jax_enable_x64),
+        os.environ.get("XLA_FLAGS", ""),
     ]
     name = f"{function.__module__}.{function.__qualname__}"
     return hashlib.sha256(_pickled((_source(), built_on, name, given))).hexdigest()[:40]

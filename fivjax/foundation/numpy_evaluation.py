@@ -61,15 +61,20 @@ def by_numpy(function: Callable[P, R], *, always: bool = False, up_to: float = m
                 return jax.tree.map(_numbers, of_large_arrays()(*args, **kwargs))
             calls[form] += 1
             if calls[form] > REPAID and not always:
-                return jax.tree.map(_numbers, otherwise(*args, **kwargs))
+                return by_xla(*args, **kwargs)
             try:
-                latest[key] = found = computed(form, arrays)
+                # A result may be a view of an argument.
+                latest[key] = found = jax.tree.map(_copied, computed(form, arrays))
             except NoSuchCase:
-                return jax.tree.map(_numbers, otherwise(*args, **kwargs))
+                return by_xla(*args, **kwargs)
             with contextlib.suppress(KeyError):  # where threads leave out the same
                 while len(latest) > (FEW if always else LATEST):
                     latest.popitem(last=False)
         return jax.tree.map(_copied, found)
+
+    def by_xla(*args, **kwargs) -> R:
+        with jax.enable_x64(True):
+            return jax.tree.map(_numbers, otherwise(*args, **kwargs))
 
     def computed(form: Form, arrays: list) -> R:
         if form not in plans:

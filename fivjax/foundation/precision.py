@@ -143,4 +143,5 @@ def real_if_real(leaf):
 
 def real(value) -> Array:
     """`value` as a float64 JAX array, also where a caller in single precision handed over float32."""
-    return jnp.asarray(value, dtype=jnp.float64)
+    # JAX may share the memory of NumPy's arrays, which their owner may change later.
+    return jnp.asarray(value.copy() if isinstance(value, np.ndarray) else value, dtype=jnp.float64)

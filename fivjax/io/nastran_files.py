@@ -119,6 +119,10 @@ def _fields(here: str, line: str) -> list[str]:
     """The fields of a line without the first and the last, which name the card and its continuation."""
     if "," in line:
         fields = [field.strip() for field in line.split(",")]
+        if any(fields[10:]):
+            raise ValueError(
+                f"{here}: a line has ten fields at most, but this one has {len(fields)}. Continue it on the next one."
+            )
         return [*fields[1:9], *[""] * 8][:8]
     if "\t" in line:
         raise ValueError(f"{here}: tabs do not fit fixed fields. Write fields of 8 or 16 characters, or commas.")

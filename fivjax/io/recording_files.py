@@ -95,11 +95,19 @@ def read_recording(
     for name in (*columns, *units):
         _must_have(path, found, name)
     units = {**own_units, **units}
-    signals = {}
+    signals, named = {}, {}
     for name, meaning in columns.items():
+        if (before := named.setdefault(channel(meaning), name)) != name:
+            raise ValueError(
+                f"File `{path}`: the columns `{before}` and `{name}` are both of the channel `{channel(meaning)}`. Say which "
+                f"one counts with `columns`."
+            )
         unit = _unit(path, name, channel(meaning).quantity, units)
         signals[channel(meaning)] = scale * unit * _vector(path, name, found[name])
-    time = next((name for name in found if name.lower() in ("t", "time")), None) if time is None else time
+    if time is None:
+        time = next(
+            (name for name in ("t", "time", "T", *found) if name in found and name.lower() in ("t", "time")), None
+        )
     if own_rate is not None:
         base = float(own_rate)
     elif time is not None:
@@ -163,7 +171,8 @@ def _csv(path: Path):
             # A comma can only be a decimal comma where it is not the separator.
             text = entry.strip().replace(",", ".") if separator != "," else entry.strip()
             try:
-                table[row, column] = float(text)
+                # Python takes underscores between digits, too.
+                table[row, column] = float(text.replace("_", "no number"))
             except ValueError:
                 raise ValueError(
                     f"File `{path}`, line {number}, column `{names[column]}`: {entry.strip()[:60]!r} is no number."

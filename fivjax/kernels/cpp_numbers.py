@@ -78,6 +78,9 @@ BY_NUMBER = {
     "not": "!{}",
     "is_finite": "({0} - {0} == 0.0)",
 }
+# Of whole numbers, one by one and side by side, where what holds is -1: as in JAX by zero, which would end the process.
+WHOLE_QUOTIENT = "({1} == 0 ? -1 : {0} / {1})", "(({1} == 0) | ({0} / ({1} - ({1} == 0))))"
+WHOLE_REMAINDER = "({1} == 0 ? {0} : {0} % {1})", "((({1} == 0) & {0}) | ({0} % ({1} - ({1} == 0))))"
 # What leaves each number as it is.
 SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
 COMPARISONS = ("lt", "le", "lt_to", "le_to", "gt", "ge", "eq", "ne", "is_finite")

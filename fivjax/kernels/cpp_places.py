@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from jax.lax import GatherScatterMode
 
 from ..foundation.numpy_primitives import gathered_places, scattered_places
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers, reshaped
@@ -123,7 +124,7 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
     one_of_each = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     kept = [axis for axis in range(view.ndim) if axis not in one_of_each]
     found = np.empty(equation.outvars[0].aval.shape, object)
-    parts = {}
+    parts, within = {}, {}
     for batch in np.ndindex(places.shape[:-1]):
         starts = [of_numbers(0)] * view.ndim
         for axis, of_batch in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
@@ -131,13 +132,45 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
         for position, axis in enumerate(numbers.start_index_map):
             starts[axis] = np.asarray(places[(*batch, position)], object)
         parts[batch] = _from(writer, view, starts, sizes)
+        if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
+            within[batch] = _is_within(writer, starts, np.subtract(view.shape, sizes).tolist())
     for place in np.ndindex(found.shape):
         batch = tuple(at for axis, at in enumerate(place) if axis not in numbers.offset_dims)
         own = dict(zip(kept, (place[axis] for axis in numbers.offset_dims), strict=True))
         index = tuple(own.get(axis, 0) for axis in range(view.ndim))
         part = parts[batch]
         found[place] = part.at(index) if isinstance(part, View) else part[index]
+        if batch in within:
+            fill = fill_of(equation)
+            found[place] = writer.one("select_n", CHOICE, [within[batch], fill, found[place]], kind)
     return found
+
+
+def _is_within(writer: Writer, starts, most: list[int]):
+    """Whether all places of a part are those of the array."""
+    held = True
+    for start, last in zip(starts, most, strict=True):
+        entry = writer.entries(start).item()
+        for name, end in (("ge", 0), ("le", last)):
+            if isinstance(entry, str):
+                own = writer.one(name, BY_NUMBER[name], [entry, end], "bool")
+                held = own if held is True else writer.one("and", BY_NUMBER["and"], [held, own], "bool")
+            elif not (entry >= end if name == "ge" else entry <= end):
+                return False
+    return held
+
+
+def fill_of(equation):
+    """The number that JAX gives for places outside of an array."""
+    value, dtype = equation.params["fill_value"], equation.outvars[0].aval.dtype
+    if value is not None:
+        return dtype.type(value).item()
+    if np.issubdtype(dtype, np.floating):
+        return float("nan")
+    if np.issubdtype(dtype, np.bool_):
+        return True
+    limits = np.iinfo(dtype)
+    return int(limits.min if limits.min < 0 else limits.max)
 
 
 def _scatter(writer: Writer, equation, operands, kind: str) -> Value:

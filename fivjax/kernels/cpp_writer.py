@@ -24,6 +24,8 @@ from .cpp_numbers import (
     BY_NUMBER,
     COMPARISONS,
     SAME,
+    WHOLE_QUOTIENT,
+    WHOLE_REMAINDER,
     WIDE,
     converted,
     keeping_nan,
@@ -273,7 +275,9 @@ class Writer:
             form = form if power > 0 else f"1.0 / ({form})"
         elif name == "rem":
             real = "wp::fmod({}, {})" if self._any_wide_lanes(operands) else "__builtin_fmod({}, {})"
-            form = real if kind == "double" else "({} % {})"
+            form = real if kind == "double" else WHOLE_REMAINDER[self._any_wide_lanes(operands)]
+        elif name == "div" and kind != "double":
+            form = WHOLE_QUOTIENT[self._any_wide_lanes(operands)]
         elif name == "round":
             form = (
                 "wp::round({})"

@@ -20,7 +20,7 @@ from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates, sliding_states
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import MOST_SEGMENTS
+from ..section.crossings import MOST_IN_KICK
 from ..steppers.core import follow
 from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.kernel_scope import has_kernel
@@ -208,12 +208,13 @@ class Histories:
             during = np.sum(np.abs(vectors), axis=-1)
             crude = 2 * self.pieces * float(np.sum(np.abs(own) * np.abs(rates) ** 4))
             peak = _peak(during, np.sum(np.abs(second), axis=-1), crude, inside[1] - inside[0])
-            rows = own[:, None] * (np.exp(np.outer(rates, -edges[1:])) - np.exp(np.outer(rates, -edges[:-1])))
+            # Afterwards, by the time since then: of that since the beginning, powers of modes that decay fast overflow.
+            until = np.exp(np.outer(rates, self.time - edges))
+            rows = own[:, None] * (until[:, 1:] - until[:, :-1])
             step = 2 * np.pi / (COARSE * fastest)
-            sizes, later = _later(rows, rates, step, self.time, _sum_of_sizes)
-            bends, _ = _later(rows * rates[:, None] ** 2, rates, step, self.time, _sum_of_sizes)
-            ends = np.exp(rates.real * self.time)[:, None]
-            crude = float(np.sum(np.abs(rows) * ends * np.abs(rates[:, None]) ** 4))
+            sizes, later = _later(rows, rates, step, 0.0, _sum_of_sizes)
+            bends, _ = _later(rows * rates[:, None] ** 2, rates, step, 0.0, _sum_of_sizes)
+            crude = float(np.sum(np.abs(rows) * np.abs(rates[:, None]) ** 4))
             size = min(size, margin / max(peak, _peak(sizes, bends, crude, step)))
             for values, rows in ((during, vectors), (sizes, later)):
                 shapes.append(-np.sign(rows[_highest(values)]))
@@ -273,9 +274,7 @@ def _at_end(args, _):
         y, contact = carry
         # Loads are deviations from the final load.
         more, part = factor * scene.load.final, time / len(factors)
-        after = follow(
-            for_derivatives(EXACT_STEPPER), mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax"
-        )
+        after = follow(for_derivatives(EXACT_STEPPER), mechanics, contact, more, y, part, most=MOST_IN_KICK, kind="lax")
         return (after.y, after.contact), None
 
     sliding = Contact.sliding(jnp.sign(mechanics.belt_speed))

@@ -71,14 +71,18 @@ def modes(system: Structure | Scene, *, direction: int = 1, progress: bool | Non
             followed.append(now)
             tick()
         dataset = _modes_dataset(scene, name, values, followed)
-        if name == "mu" and scene.friction.constant:
+        directions = np.unique(np.sign(values if name == "belt_speed" else scene.belt_speed)).astype(int)
+        slides = int(directions[0]) if len(directions) == 1 else None
+        # Of contacts that slide in several directions the limit is not known.
+        if name == "mu" and scene.friction.constant and slides is not None:
             stage("finding the stability limit")
-            dataset = dataset.assign(_limits(scene))
-    return labelled(dataset, scene, analysis="modes of steady sliding", direction=direction)
+            dataset = dataset.assign(_limits(scene, slides))
+    return labelled(
+        dataset, scene, analysis="modes of steady sliding", direction="several" if slides is None else slides
+    )
 
 
-def _limits(scene: Scene) -> dict:
-    direction = 1 if scene.belt_speed > 0 else -1
+def _limits(scene: Scene, direction: int) -> dict:
     limit = stability_limit(scene.structure, direction=direction)
     said = {"outcome": limit.outcome.value, "mechanism": limit.mechanism.value}
     found = {

@@ -214,6 +214,7 @@ def create(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dic
 
 def _fill(part: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dict[str, np.ndarray]) -> None:
     """Make an empty store of a folder."""
+    zarr()  # says what is to be done where it is not installed
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     codecs = {"compressors": [ZstdCodec(), Crc32cCodec()]}

@@ -22,6 +22,8 @@ from .peak_speed import higher_peak
 
 # The most segments from one point of the section to the next: enough for hundreds of events.
 MOST_SEGMENTS = 4096
+# And during a kick, which may be long.
+MOST_IN_KICK = 64 * MOST_SEGMENTS
 
 
 class Point(eqx.Module):
@@ -112,6 +114,7 @@ def to_crossing(
         known = isinstance(peaks, bool)
         peak = jax.lax.cond(peaks, higher, lambda: way.peak) if not known else higher() if peaks else way.peak
         crosses = after.rise.happened & ~kicked
+        counts_anew = crosses if kick is None else crosses | (kicked & (kick.duration <= 0))
         return _Carry(
             after.y,
             after.contact,
@@ -120,13 +123,14 @@ def to_crossing(
             way.crossed + crosses,
             way.events + (jnp.any(after.ended) & ~kicked),
             way.changes + (jnp.any(after.contact.status != way.contact.status) & ~kicked),
-            jnp.where(crosses, 0, way.segments + 1),
+            jnp.where(counts_anew, 0, way.segments + 1),
             peak,
         )
 
     def until(way: _Carry, crossed) -> _Carry:
         def going(way: _Carry):
-            return (way.left > 0) & (way.crossed < crossed) & (way.segments < MOST_SEGMENTS)
+            most = MOST_SEGMENTS if way.kick is None else jnp.where(way.kick.duration > 0, MOST_IN_KICK, MOST_SEGMENTS)
+            return (way.left > 0) & (way.crossed < crossed) & (way.segments < most)
 
         return jax.lax.while_loop(going, further, way)
 

@@ -113,9 +113,9 @@ def _can_be_written(function: Callable, form: Form) -> bool:
 def _values(args, instants):
     """The values of laws, and how friction changes with time while slip does."""
     friction, load, slip = args
-    values = [friction(slip)]
+    values = [friction(slip), jax.vmap(friction)(jnp.stack([slip, slip]))]
     if not friction.constant:
         next_term = friction.in_time(slip, 3)
-        values.append(next_term([slip, slip], values))
+        values.append(next_term([slip, slip], values[:1]))
     jumps = load.jumps
     return (tuple(values), load(jnp.ravel(slip)[0]), jumps), ()

@@ -57,7 +57,9 @@ def trusted(states: Float[Array, "k state"], tolerance: float) -> Float[Array, "
         # The logarithm of h where |c_last| h^last = tolerance |c_j| h^j. In slow motion of a stiff structure the last term may
         # underflow; it then counts as the smallest normal number.
         end = jnp.log(jnp.maximum(size(last), tiny))
-        return [(jnp.log(tolerance * size(j)) - end) * (1.0 / (last - j)) for j in first]
+        # So does what is asked for of the first ones, in a motion that has faded to next to nothing.
+        asked = [jnp.where(size(j) > 0, jnp.maximum(tolerance * size(j), tiny), 0.0) for j in first]
+        return [(jnp.log(most) - end) * (1.0 / (last - j)) for j, most in zip(first, asked, strict=True)]
 
     def nearest(*first):
         # The larger h, because either coefficient may vanish.

@@ -49,6 +49,21 @@ def test_the_hundred_and_first_call_gives_what_the_first_gives():
             assert array.tolist() == [2.0, 2.0 * k] and number == 2.0
 
 
+def test_what_is_kept_of_a_call_is_no_view_of_its_arguments():
+    turned, x = by_numpy(lambda x: (x.T, x)), np.arange(4.0).reshape(2, 2)
+    turned(x)
+    x[:] = 99.0
+    again, same = turned(np.arange(4.0).reshape(2, 2))
+    assert again.tolist() == [[0.0, 2.0], [1.0, 3.0]] and same.tolist() == [[0.0, 1.0], [2.0, 3.0]]
+
+
+def test_the_hundred_and_first_call_is_in_double_precision_too():
+    sine = by_numpy(jnp.sin)
+    found = [sine(np.float64(k)) for k in range(numpy_evaluation.REPAID + 3)]
+    assert not jax.config.jax_enable_x64 and {one.dtype for one in found} == {np.dtype(np.float64)}
+    np.testing.assert_allclose(found, np.sin(np.arange(len(found))), rtol=1e-14, atol=1e-15)
+
+
 def test_names_may_be_strings_of_numpy():
     known = by_numpy(lambda names, x: len(names) * x)
     assert known((np.str_("mu"), np.array(["k1"])[0]), 3.0) == known(("mu", "k1"), 3.0) == 6.0

@@ -175,3 +175,17 @@ def test_bad_recordings(make, fragments):
         make()
     for fragment in fragments:
         assert fragment in str(refusal.value)
+
+
+def test_two_columns_of_one_channel_are_refused(tmp_path):
+    path = csv(tmp_path, table("t,a0,acceleration 0", zip(T, A, A, strict=True)))
+    with pytest.raises(
+        ValueError, match="the columns `a0` and `acceleration 0` are both of the channel `acceleration 0`"
+    ):
+        fj.read_recording(path)
+    assert fj.read_recording(path, columns={"a0": "a0"}).values.shape[1] == 1
+
+
+def test_t_is_the_time_where_there_is_another_t(tmp_path):
+    path = csv(tmp_path, table("T,t,a0", zip(100 * T, T, A, strict=True)))
+    np.testing.assert_allclose(fj.read_recording(path).t, T, atol=1e-9)

@@ -389,3 +389,28 @@ def test_what_differs_by_the_sign_of_a_zero_is_not_the_same():
 
     found, _ = KernelFunction(signs)((np.ones((9, 9)),))
     assert tuple(map(float, found)) == (np.inf, -np.inf)
+
+
+def at_the_edges(args, instants):
+    table, i, n = args
+    places = jnp.stack([i, i + 1])
+    return {
+        "filled": [jnp.take(table, i), table.at[places].get(mode="fill", fill_value=0.5), jnp.take(table, places)],
+        "clamped": [table[i], table.at[places].get(mode="clip")],
+        "whole": [n // i, n % i, jnp.where(i == 0, n, n // i)],
+    }, ()
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_places_outside_of_a_table_and_division_by_zero_are_as_in_jax():
+    """Neither of them is anything for C++; a division would end the process."""
+    table, places = np.array([10.0, 20.0, 30.0]), np.array([0, 1, 2, 3, 7, -1, -3, -9, 5])
+    kernel, form = KernelFunction(at_the_edges), Form.of((table, places[0], places[0]))[0]
+    rows = np.concatenate([np.tile(table, (9, 1)), places[:, None], np.full((9, 1), -7)], axis=1).astype(float)
+    with jax.enable_x64(True):
+        own = jnp.asarray(table)
+        expected = jax.vmap(lambda i: at_the_edges((own, i, jnp.asarray(-7)), None)[0])(places)
+    for side_by_side in (False, True):
+        found, _ = kernel.of_many(form, rows, side_by_side=side_by_side)
+        for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_array_equal(own, other)

@@ -179,3 +179,18 @@ def test_a_saddle_may_slide_all_the_time():
     assert slope == pytest.approx((high - low) / (2 * step), rel=1e-5)
     verdicts = fj.bistability_map(scene, p=[p - 1e-7, p + 1e-7], progress=False)["verdict"].values
     assert verdicts.tolist() == [0, 1]
+
+
+def test_a_long_kick_has_its_derivatives():
+    """While it lasts the motion has as many steps as it takes; those after it are counted anew."""
+    found = fj.critical_perturbation(
+        SCENE.replace(mu=0.227, belt_speed=1.0, duration=25.0), p_range=(1.12, 1.14), derivatives=True, progress=False
+    )
+    assert found["kind"].item() == "manifold" and np.all(np.isfinite(found["d_p_crit"]))
+    below, above = (
+        fj.bistability_map(
+            SCENE.replace(mu=0.227, belt_speed=1.0, duration=25.0), p=[found["p_crit"].item() + by], progress=False
+        )
+        for by in (-1e-6, 1e-6)
+    )
+    assert below["verdict"].item() == fj.Verdict.SLIDING and above["verdict"].item() == fj.Verdict.LIMIT_CYCLE

@@ -254,3 +254,12 @@ def test_the_search_goes_on_to_a_minimum_though_a_guess_too_far_off_shortens_its
         scene, duration=[found.duration], p_range=(found.p - 1e-3, found.p + 1e-3), p_step=1e-3, derivatives=True
     )
     assert abs(float(at["d_p_crit"].sel(parameter="duration").squeeze())) < 1e-7
+
+
+def test_a_history_under_strong_damping_is_certified():
+    """Its powers overflow where they are taken from the beginning of the history."""
+    scene = SCENE.replace(c1=2000.0)
+    with jax.enable_x64(True):
+        kind = Histories(scene, 4, 0.212)
+        certificate = kind.certificate()
+    assert 0.99 < max(max(driven(kind, certificate.size * shape)) for shape in certificate.shapes) <= 1.0

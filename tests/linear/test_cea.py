@@ -1,5 +1,7 @@
 """Linear theory against independent routes: Eq. 3 by hand with NumPy and SciPy, closed forms, and itself in disguise."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,7 @@ from fivjax.linear.linearisation import linear_sliding
 from fivjax.linear.outcomes import Mechanism, StabilityOutcome
 from fivjax.model.scene import steady_sliding
 from tests.helpers import linear_reference as reference
+from tests.helpers.several_contacts import copies
 
 # μ_crit is a root where the growth rate has a slope of some 500/s and rounding of some 1e-12/s: both routes agree to 1e-14.
 MU_CRIT = reference.critical_friction()
@@ -764,3 +767,17 @@ def test_a_function_of_parameters_is_differentiated_in_a_program_in_single_preci
         slope = jax.grad(lambda c: fj.cea.critical_friction(structure.replace(c=c)))(2.1)
     ahead, behind = (float(fj.cea.critical_friction(structure.replace(c=2.1 + h))) for h in (1e-3, -1e-3))
     assert float(slope) == pytest.approx((ahead - behind) / 2e-3, rel=1e-5)
+
+
+def test_modes_of_contacts_with_belts_of_their_own():
+    """Where all belts run one way there is a limit; the scene's own directions are told."""
+    structure = copies(2)
+    mus = np.linspace(0.1, 0.3, 3)
+    one_way, both, backwards = (
+        cea.modes(fj.Scene(structure, fj.Coulomb(0.2), belts, fj.ConstantLoad(100.0)), mu=mus)
+        for belts in ([1.0, 2.0], [1.0, -2.0], [-1.0, -2.0])
+    )
+    assert float(one_way["mu_crit"]) == pytest.approx(float(cea.critical_friction(structure)))
+    assert "mu_crit" not in both
+    told = [json.loads(found.attrs["settings"])["direction"] for found in (one_way, both, backwards)]
+    assert told == [1, "several", -1]

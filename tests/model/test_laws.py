@@ -141,8 +141,46 @@ class FromOutside(fj.AbstractFriction):
         return jax.pure_callback(lambda v: 0.4 + 0.0 * v, like, slip_speed)
 
 
+class Filled(fj.AbstractFriction):
+    """Piecewise linear over a table, and 0.1 beyond it."""
+
+    def __call__(self, slip_speed):
+        table, place = jnp.array([0.3, 0.25, 0.2]), slip_speed / 0.5
+        low = jnp.floor(place).astype(int)
+        before, after = (jnp.take(table, k, mode="fill", fill_value=0.1) for k in (low, low + 1))
+        return before + (after - before) * (place - low)
+
+
+class Dropped(fj.AbstractFriction):
+    """The same, by weights of which those beyond the table are dropped."""
+
+    def __call__(self, slip_speed):
+        place = slip_speed / 0.5
+        low = jnp.floor(place).astype(int)
+        weights = jnp.zeros(3).at[low].set(low + 1 - place).at[low + 1].add(place - low)
+        return 0.1 + weights @ jnp.array([0.2, 0.15, 0.1])
+
+
+@pytest.mark.parametrize("law", [Filled(), Dropped()])
+def test_what_is_beyond_a_table_is_what_jax_says(law):
+    """On a belt beyond its end the block is drawn aside by 0.1; between its entries, by what lies between."""
+    for belt_speed, friction in ((3.0, 0.1), (0.8, 0.22)):
+        scene = block(law, belt_speed)
+        run = fj.simulate(scene, 0.5, 0.1)
+        np.testing.assert_allclose(run.friction_force[0], friction, rtol=1e-12)
+        assert run.meaning == "reached its end"
+
+
 @pytest.mark.parametrize(
-    ("law", "by_kernel"), [(Table(), True), (Looped(), True), (Branched(), True), (FromOutside(), False)]
+    ("law", "by_kernel"),
+    [
+        (Table(), True),
+        (Looped(), True),
+        (Branched(), True),
+        (FromOutside(), False),
+        (Filled(), True),
+        (Dropped(), False),
+    ],
 )
 def test_a_law_is_followed_by_a_kernel_if_its_trace_can_be_written(law, by_kernel):
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.3), belt_speed=1.0, load=fj.ConstantLoad(100.0))

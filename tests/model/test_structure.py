@@ -208,6 +208,16 @@ def test_replace_of_a_structure_given_as_matrices_says_why_not():
         structure.replace(k1=1.0)
 
 
+def test_what_happens_to_an_array_later_does_not_reach_the_structure():
+    """JAX shares the memory of NumPy's arrays that begin at a multiple of 64 bytes."""
+    memory = np.zeros(36 + 8)
+    stiffness = memory[(-memory.ctypes.data // 8) % 8 :][:36].reshape(6, 6)
+    stiffness[:] = 1e4 * np.eye(6)
+    structure = fj.Structure(np.eye(6), np.eye(6), stiffness, [0.0, -1.0, 0.0, 0.0, 0.0, 0.0], tangential=0, normal=1)
+    stiffness[0, 0] = 999.0
+    assert float(structure.stiffness[0, 0]) == 1e4
+
+
 def test_replacing_nothing_changes_nothing():
     """Replacing nothing is allowed, so that a loop over parameters also works where there are none."""
     structure = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1)

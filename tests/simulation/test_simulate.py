@@ -313,3 +313,14 @@ def test_a_batch_of_trajectories_is_refused_where_one_is_asked_for(paper_scene):
             ask()
     np.testing.assert_array_equal(jax.tree.map(lambda x: x[1], runs).gap, one.gap)
     np.testing.assert_array_equal(np.asarray(jax.vmap(lambda run: run.displacement)(runs))[1], one.displacement)
+
+
+def test_a_motion_fades_to_nothing_and_the_run_goes_on():
+    """Until its numbers lose their digits, and on: what is left of it after 2,000 s of exp(-t) is less than any number."""
+    structure = fj.Structure(np.eye(2), np.diag([2.0, 0.0]), 10.0 * np.eye(2), [0.0, -1.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.0), 1.0, fj.ConstantLoad(100.0))
+    run = fj.simulate(scene, 2000.0, 50.0, y0=[0.01, 0.0, 0.0, 0.0])
+    assert run.meaning == "reached its end"
+    decay = np.exp(-run.t) * (np.cos(3 * run.t) + np.sin(3 * run.t) / 3)
+    np.testing.assert_allclose(run.displacement[:13, 0], 0.01 * decay[:13], rtol=1e-9)
+    assert np.all(np.abs(run.displacement[15:, 0]) < 1e-300)
