@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..contact import Mechanics, slides_uniquely
 from ..foundation.kept_programs import kept
 from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, real
@@ -92,7 +93,9 @@ def _chart(scene, names, columns):
         mass, damping, stiffness = steady_matrices(point, normal_force)
         scale = time_scale(point.structure)
         coefficients = characteristic_polynomial(mass, damping, stiffness, scale)
-        ok = _slides(point, normal_force) & (mass[0, 0] > 0)
+        (against,), _ = determinant([[[entry] for entry in row] for row in mass])
+        # That determinant is of the sign of the contact's normal compliance, which is negative past Painlevé's limit.
+        ok = _slides(point, normal_force) & (against > 0)
         smallest = jnp.min(jnp.stack(hurwitz_determinants(coefficients)))
         return [jnp.where(ok, c, jnp.nan) for c in coefficients], scale, jnp.where(ok, smallest, jnp.nan), normal_force
 
@@ -107,7 +110,7 @@ def _chart(scene, names, columns):
     def by_eigenvalues(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))
         matrix, forces = sliding_motion(point)
-        ok = _slides(point, forces) & jnp.all(jnp.isfinite(matrix))
+        ok = _slides(point, forces) & jnp.all(jnp.isfinite(matrix)) & slides_uniquely(Mechanics(point))
         roots = eigenvalues(jnp.where(ok, matrix, jnp.eye(matrix.shape[0])))
         fastest = jnp.argmax(roots.real)
         results = roots.real[fastest], jnp.abs(roots.imag[fastest]) / (2 * jnp.pi), jnp.nan

@@ -781,3 +781,19 @@ def test_modes_of_contacts_with_belts_of_their_own():
     assert "mu_crit" not in both
     told = [json.loads(found.attrs["settings"])["direction"] for found in (one_way, both, backwards)]
     assert told == [1, "several", -1]
+
+
+@pytest.mark.parametrize("tangential", [0, 1])
+def test_a_chart_ends_at_painleve_s_limit_whichever_coordinate_is_the_tangential_one(tangential):
+    """Against the tangential direction, where sliding beyond it has no solution, or two."""
+    order = [0, 1, 2] if tangential == 0 else [1, 0, 2]
+    mass, damping, stiffness, load = (np.asarray(matrix) for matrix in fj.belt_oscillator().matrices)
+    square = np.ix_(order, order)
+    structure = fj.Structure(
+        mass[square], damping[square], stiffness[square], load[order], tangential=tangential, normal=2
+    )
+    mus = float(fj.painleve_friction(structure)) * np.array([0.5, 0.999, 1.001, 1.5])
+    # Without a load, because the normal force is negative before that limit.
+    scene = fj.Scene(structure, fj.Coulomb(0.2), -1.0, fj.ConstantLoad(0.0))
+    chart = cea.chart(scene, mu=mus, force=np.array([0.0, 1.0]))
+    assert np.isnan(chart["growth_rate"].values[:, 0]).tolist() == [False, False, True, True]
