@@ -13,7 +13,13 @@ from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
-from ..model.scene import Scene, refuse_several_contacts, steady_sliding, steady_slip_speeds
+from ..model.scene import (
+    Scene,
+    refuse_several_contacts,
+    sliding_equilibrium,
+    steady_sliding,
+    steady_slip_speeds,
+)
 from ..model.sliding import contact_coordinates, free_in_sliding
 from ..model.structure import Structure
 from .crossings import first_limit
@@ -184,7 +190,7 @@ def critical_slope(scene: Scene) -> Float[Array, ""]:
     **Returns:** `-inf` where no slope makes sliding unstable, and 0 where it is unstable even without a slope (by mode
     coupling).
 
-    **Raises:** `ValueError` for a belt at rest, and for several contacts.
+    **Raises:** `ValueError` for a belt at rest, for a scene without sliding equilibrium, and for several contacts.
 
     **Example:**
 
@@ -193,6 +199,7 @@ def critical_slope(scene: Scene) -> Float[Array, ""]:
     """
     scene = as_scene(_a_scene(scene), None, 1)
     refuse_several_contacts(scene.structure, "`critical_slope`", "`growth_rate` takes several.")
+    sliding_equilibrium(scene)
     return _slope_limit(scene)
 
 

@@ -59,7 +59,7 @@ def in_contact_coordinates(structure: Structure) -> Structure:
     # Of the coordinates that the contacts' directions become.
     kinds = ("tangential", "normal")
     for place, name in zip(places, [kind + suffix for kind in kinds for suffix in suffixes], strict=True):
-        names[place] = name
+        names[place] = name if name not in names else f"{name} of the contact"
     contacts = [ContactPoint(places[i], places[count + i]) for i in range(count)]
     source = structure.source
     if not isinstance(source, FromParameters):

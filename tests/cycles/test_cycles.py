@@ -1,5 +1,6 @@
 """Limit cycles against closed forms, against ODE solvers of another kind (`reference/cycles.json`), and against trajectories."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -17,6 +18,7 @@ from fivjax.section.return_maps import Section
 from tests.helpers import reference
 from tests.helpers.catalogue import full_matrices
 from tests.helpers.reference.cycles import stored
+from tests.helpers.several_contacts import copies
 
 REFERENCE = stored()
 
@@ -449,3 +451,9 @@ def test_cycles_that_many_initial_states_come_to_are_found(
     amplitudes = np.array([cycle.amplitude for cycle in fj.limit_cycles(scene, progress=False)])
     for amplitude in often:
         assert np.min(np.abs(amplitudes / amplitude - 1)) < 1e-4
+
+
+def test_derivatives_by_what_each_contact_has_for_itself_are_refused(cycle):
+    own = dataclasses.replace(cycle, scene=fj.Scene(copies(2), fj.Coulomb(0.2), [1.0, 1.2], fj.ConstantLoad(100.0)))
+    with pytest.raises(ValueError, match="`belt_speed` holds one for each contact"):
+        fj.cycle_derivatives(own, ["belt_speed"])

@@ -29,6 +29,12 @@ def belt(**parameters):
     return fj.belt_oscillator(**parameters)
 
 
+def pulled() -> fj.Scene:
+    """The load pulls the mass off the belt."""
+    structure = fj.Structure(np.eye(2), np.eye(2), 1e4 * np.eye(2), [0.0, 1.0], tangential=0, normal=1)
+    return fj.Scene(structure, fj.ExponentialDecay(0.2, 0.1, 0.5), 1.0, fj.ConstantLoad(100.0))
+
+
 def matrices(structure):
     return {
         "mass": np.asarray(structure.mass),
@@ -673,6 +679,7 @@ FALLING = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.5, 0.05, 0.5))
         (lambda: cea.linearisation(SCENE.replace(belt_speed=0.0)), "nothing slides steadily"),
         (lambda: cea.critical_friction(SCENE), "must be a Structure"),
         (lambda: cea.critical_slope(belt()), "must be a Scene"),
+        (lambda: cea.critical_slope(pulled()), "no sliding equilibrium: the belt would have to pull"),
         (lambda: cea.coalescence(belt(), damped=1), "`damped` must be True or False"),
         (lambda: cea.margin(belt(), np.nan), "`mu` must be finite"),
         (lambda: cea.chart(belt(), mu=[0.1, 0.2]), "exactly two axes"),

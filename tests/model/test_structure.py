@@ -208,6 +208,15 @@ def test_replace_of_a_structure_given_as_matrices_says_why_not():
         structure.replace(k1=1.0)
 
 
+def test_coordinates_may_be_called_like_the_directions_of_a_contact():
+    contact = fj.ContactPoint(tangential=(0.6, 0.8), normal=(-0.8, 0.6))
+    structure = fj.Structure(
+        np.eye(2), np.eye(2), 1e4 * np.eye(2), [0.0, -1.0], contacts=[contact], coordinates=("tangential", "normal")
+    )
+    names = fj.in_contact_coordinates(structure).coordinates
+    assert len(set(names)) == 2
+
+
 def test_what_happens_to_an_array_later_does_not_reach_the_structure():
     """JAX shares the memory of NumPy's arrays that begin at a multiple of 64 bytes."""
     memory = np.zeros(36 + 8)
