@@ -93,7 +93,8 @@ def after_brief_flights(mechanics: Mechanics, contact: Contact, load: Float[Arra
     g_tt, g_tn, g_nn = mechanics.compliance
     tangential_force, normal_force = contact_forces(mechanics, contact, load, y)
     pressing = g_tn * tangential_force + g_nn * normal_force
-    e = jnp.where(mechanics.restitution < 1, mechanics.restitution, 0.0)
+    # With hardly any loss they never end, and no rebound counts as rest.
+    e = jnp.where(mechanics.restitution < 1 - 1e-6, mechanics.restitution, 0.0)
     # In all, per m/s: the time of the flights, in s, and the changes of the gap's rate by the impacts that end them.
     flight, jump = 2.0 / (1 - e) / jnp.where(pressing > 0, pressing, 1.0), (1 + e) / (1 - e)
     if mechanics.impact_law == "reset":

@@ -237,7 +237,8 @@ def simulate(
             f"Argument `dt_save` asks for {asked:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
             f"{most_rows:.0e}. Save less often, or stop earlier."
         )
-    rows = math.ceil(asked - 1e-9)
+    # The quotient is rounded: by that alone there is no row more.
+    rows = math.ceil(asked * (1 - 1e-12) - 1e-9)
     start, given = ("sliding equilibrium", None) if y0 is None else ("given by y0", start_state(scene, y0))
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)

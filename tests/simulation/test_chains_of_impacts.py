@@ -87,3 +87,16 @@ def test_two_masses_kick_each_other_up_ever_less():
     for name, change in {"mu_0": [impulses[0], 0.0], "mu_1": [0.0, impulses[1]], "force": mu * t1}.items():
         np.testing.assert_allclose(found[name][ahead], np.linalg.solve(coupling, change), rtol=1e-7)
     assert np.all(found.value[[1, 3, 5, 7]] == 0.0)
+
+
+@pytest.mark.parametrize("law", ["frictionless", "reset"])
+@pytest.mark.parametrize("loss", [1e-13, 1e-10, 0.0])
+def test_a_landing_of_next_to_nothing_changes_next_to_nothing(law, loss):
+    """Also with hardly any loss, where what its rebounds change would be divided by that: 30 m/s out of 1e-13."""
+    scene = fj.Scene(
+        fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.ConstantLoad(100.0), restitution=1 - loss, impact_law=law
+    )
+    y0 = np.concatenate([fj.sliding_equilibrium(scene), [0.0, 0.0, -1e-13]])
+    y0[2] = 1e-24
+    run = fj.simulate(scene, 1e-3, 1e-4, y0=y0)
+    assert run.meaning == "reached its end" and np.max(np.abs(run.velocity)) < 1e-10
