@@ -125,7 +125,12 @@ class KickMisfit(AbstractWaveformMisfit):
 def free_waves(scene: Scene, matrix, sampled: Sampled, channels: tuple[Channel, ...]) -> Float[Array, "B k m"]:
     """Blocks of the free motion with this state matrix, for each unit initial state."""
     m = matrix.shape[0] // 2
-    states = powers(exponential(sampled.width * matrix), sampled.count) @ _inside(matrix, sampled)
+    # Velocities in units of a frequency: of entries that differ by its square, exponentials lose digits.
+    squares = jax.lax.stop_gradient(jnp.max(jnp.abs(matrix[m:, :m])))
+    units = jnp.append(jnp.ones(m), jnp.full(m, jnp.sqrt(jnp.where(squares > 0, squares, 1.0))))
+    scaled = matrix * units / units[:, None]
+    states = powers(exponential(sampled.width * scaled), sampled.count) @ _inside(scaled, sampled)
+    states = states * units[:, None] / units
     rates = jnp.concatenate([states, matrix[m:] @ states], axis=1)
     keep = free_in_sliding(scene.structure).tolist()
     columns = [keep.index(channel.coordinate) + m * channel.derivative for channel in channels]

@@ -19,6 +19,7 @@ import os
 import pickle
 import platform
 import threading
+import uuid
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -243,14 +244,25 @@ def _versions() -> list[str]:
     return [f"{name} {one.version}" for name, those in found.items() for one in those[:1]]
 
 
+def _stamps() -> list[tuple[str, int, int]]:
+    """The files of fivjax's own source, with their times and sizes."""
+    root = Path(__file__).parents[1]
+    told = ((path, path.stat()) for path in sorted(root.rglob("*.py")))
+    return [(str(path.relative_to(root)), stat.st_mtime_ns, stat.st_size) for path, stat in told]
+
+
+# While this module is imported, as all others are.
+IMPORTED = _stamps()
+
+
 @functools.cache
 def _source() -> str:
-    """A digest of fivjax's own source."""
+    """A digest of fivjax's own source; where that was changed after it was imported, one that no other process has."""
     digest = hashlib.sha256()
-    root = Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.py")):
-        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
+    for name, *_ in IMPORTED:
+        path = Path(__file__).parents[1] / name
+        digest.update(name.encode() + b"\0" + (path.read_bytes() if path.exists() else b""))
+    return digest.hexdigest() if _stamps() == IMPORTED else uuid.uuid4().hex
 
 
 class _Pickler(pickle.Pickler):

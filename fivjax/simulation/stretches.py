@@ -66,6 +66,8 @@ def _advances(begin: Begin, method: AbstractStepper, most: int | Array, derivati
         begin.h,
         total=begin.ledger,
         observe=enter,
+        # The ledger counts crossings of the section.
+        at_section=energy_data is not None,
         most=most,
         kind="bounded" if derivatives == "both" else "lax",
     )

@@ -101,6 +101,15 @@ def test_other_source_and_other_arguments_are_other_programs(folder, monkeypatch
     assert function.traced == 3 and len(list(folder.iterdir())) == 3
 
 
+def test_source_that_was_changed_after_its_import_keeps_nothing_for_others(monkeypatch):
+    """A process goes on with the source that it has imported, whatever an installation has put there meanwhile."""
+    digest = kept_programs._source.__wrapped__
+    assert digest() == digest()
+    (name, time, size), *others = kept_programs.IMPORTED
+    monkeypatch.setattr(kept_programs, "IMPORTED", [(name, time - 1, size), *others])
+    assert digest() != digest()
+
+
 def test_what_a_user_wrote_is_traced_each_time(folder):
     """Its name stays when its text changes: a friction law of one's own must not be another one's."""
 
