@@ -23,7 +23,7 @@ from ..linear.spectrum import linearisation
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
 from ..model.sliding import contact_coordinates, sliding_states
-from ..section.about_sliding import sliding_state
+from ..section.about_sliding import sliding_state, weights_of
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps
 from ..simulation.trajectory import Trajectory, simulate
@@ -116,9 +116,9 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
 def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None = None) -> list[LimitCycle]:
     """All stable limit cycles that a search finds.
 
-    Motions are released as in `limit_cycle`, at the end of pulses like the scene's own of several strengths, and from each of
-    `starts` (states `(2n,)` in m and m/s, or trajectories). Several cycles may coexist; there may be others that no motion
-    reached, and tori that could not be computed. `progress` as in `limit_cycle`.
+    Motions are released as in `limit_cycle`, at the end of pulses like the scene's own of several strengths, from each of
+    `starts` (states `(2n,)` in m and m/s, or trajectories), and from sixteen states in random directions. Several cycles may
+    coexist; there may be others that no motion reached, and tori that could not be computed. `progress` as in `limit_cycle`.
 
     **Returns:** a list of `LimitCycle`, the one with the largest amplitude first; empty where all motions fade.
 
@@ -136,7 +136,7 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
             f"Argument `starts` must be a list of states `(2n,)` or trajectories, but is {arguments.describe(starts)}."
         )
     given = [_state_of(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
-    return _met(scene, [*given, *_kicked(scene)]).cycles
+    return _met(scene, [*given, *_kicked(scene)], _at_random(scene)).cycles
 
 
 def _kicked(scene: Scene) -> list[Trajectory]:
@@ -150,6 +150,19 @@ def _kicked(scene: Scene) -> list[Trajectory]:
     return [simulate(pulse.replace(p=float(p)), end, end, derivatives="none") for p in kicks]
 
 
+def _at_random(scene: Scene) -> Float[np.ndarray, "m 2n"]:
+    """Deviations from sliding in random directions, in contact: there are cycles to which no load and no mode leads."""
+    count, n = 16, scene.structure.size
+    weights, (tangential, normal) = weights_of(scene.structure), contact_coordinates(scene.structure)
+    fastest = np.max(np.atleast_1d(weights[n + tangential]) * np.abs(scene.belt_speed))
+    # The same ones each time; of the size of motions as fast as the belt, and up to ten times as large.
+    random = np.random.default_rng(0)
+    directions, sizes = random.normal(size=(count, 2 * n)), fastest * 10 ** random.uniform(-0.5, 1.0, (count, 1))
+    away = sizes * directions / np.linalg.norm(directions, axis=1, keepdims=True) / weights
+    away[:, np.atleast_1d(normal)] = away[:, n + np.atleast_1d(normal)] = 0.0
+    return away
+
+
 class Met(NamedTuple):
     """What motions come to that are released."""
 
@@ -158,13 +171,13 @@ class Met(NamedTuple):
     left: int  # motions that go on, and come to nothing that could be computed
 
 
-def _met(scene: Scene, starts: Sequence = ()) -> Met:
-    """What motions come to that are released about steady sliding and from `starts`: the further ones only if there is no cycle
-    yet, and then a cycle that is followed from a lower belt speed.
+def _met(scene: Scene, starts: Sequence = (), *beside: Float[np.ndarray, "m 2n"]) -> Met:
+    """What motions come to that are released about steady sliding and from `starts`, and then from what is `beside`, deviations
+    from sliding: the further ones only if there is no cycle yet, and then a cycle that is followed from a lower belt speed.
     """
     maps = ReturnMaps.of(scene)
     released = np.concatenate([_released(scene, LOADS, SPEEDS, starts), _along_modes(scene, maps)])
-    met = attractors_met(maps, scene, released)
+    met = attractors_met(maps, scene, released, *beside)
     if not met.cycles:
         further = attractors_met(maps, scene, _released(scene, FURTHER_LOADS, FURTHER_SPEEDS))
         met = Met(further.cycles, met.in_families + further.in_families, met.left + further.left)
@@ -194,26 +207,30 @@ def _from_slower(scene: Scene) -> LimitCycle | None:
     return None
 
 
-def attractors_met(maps: ReturnMaps, scene: Scene, states: Float[np.ndarray, "m 2n"]) -> Met:
-    """The attractors that motions from several states (deviations from sliding) come to."""
+def attractors_met(maps: ReturnMaps, scene: Scene, *states: Float[np.ndarray, "m 2n"]) -> Met:
+    """The attractors that motions from several states (deviations from sliding) come to. Those from later ones add to what the
+    earlier ones have met, and change none of it.
+    """
 
     def report(_: int) -> None:
         stage("searching")
 
-    stage("releasing motions")
-    found = Attractors.none()
-    catalogue, group = Catalogue(maps, {0: found}, report), np.zeros(len(states), int)
-    motions = search_from(catalogue, Motions(group, maps.in_contact(group, states)))
-    families = in_families(maps, motions)
-    motions, left = motions.rows(~families), 0
-    if len(motions.group):
-        stage(f"following {len(motions.group)} motions")
-        fate = fates(catalogue, motions)
-        left = len(motions.group) - len(fate.attractor) - int(np.sum(fate.without_events))
+    found, in_family, left = Attractors.none(), 0, 0
+    catalogue = Catalogue(maps, {0: found}, report)
+    for some in states:
+        stage("releasing motions")
+        group = np.zeros(len(some), int)
+        motions = search_from(catalogue, Motions(group, maps.in_contact(group, some)))
+        families = in_families(maps, motions)
+        motions, in_family = motions.rows(~families), in_family + int(np.sum(families))
+        if len(motions.group):
+            stage(f"following {len(motions.group)} motions")
+            fate = fates(catalogue, motions)
+            left += len(motions.group) - len(fate.attractor) - int(np.sum(fate.without_events))
     stage("describing what was found")
     cycles = [_described(maps, scene, one) for one in found.cycles]
     cycles += [limit_cycle_of_torus(maps, scene, one) for one in found.tori]
-    return Met(sorted(cycles, key=lambda one: -one.amplitude), int(np.sum(families)), left)
+    return Met(sorted(cycles, key=lambda one: -one.amplitude), in_family, left)
 
 
 def _described(maps: ReturnMaps, scene: Scene, cycle: StableCycle) -> LimitCycle:

@@ -457,3 +457,22 @@ def test_derivatives_by_what_each_contact_has_for_itself_are_refused(cycle):
     own = dataclasses.replace(cycle, scene=fj.Scene(copies(2), fj.Coulomb(0.2), [1.0, 1.2], fj.ConstantLoad(100.0)))
     with pytest.raises(ValueError, match="`belt_speed` holds one for each contact"):
         fj.cycle_derivatives(own, ["belt_speed"])
+
+
+def test_a_cycle_to_which_no_load_and_no_mode_leads_is_found_from_random_states():
+    """Of a structure drawn at random; that it is one, the independent solver says. Motions from it stay for fifty periods."""
+    mass = [[0.284449326878, 0.0, -0.008988922786], [0.0, 0.251338564417, 0.0], [-0.008988922786, 0.0, 0.033754550244]]
+    damping = np.array(
+        [[838.107552659, -15.689252516, -14.313375332], [0, 438.404951459, -438.124124900], [0, 0, 438.917514331]]
+    )
+    stiffness = np.array(
+        [[30830.650989, -1984.638298, 881.862847], [0, 55456.769266, -55421.245639], [0, 0, 55425.189702]]
+    )
+    damping, stiffness = (upper + np.triu(upper, 1).T for upper in (1e-3 * damping, stiffness))
+    structure = fj.Structure(mass, damping, stiffness, [0.0, -1.0, 0.0], tangential=0, normal=2)
+    scene = fj.Scene(structure, fj.Coulomb(0.526886111638), 9.535090538582, fj.ConstantLoad(100.0))
+    (cycle,) = fj.limit_cycles(scene)
+    assert cycle.kind == "periodic" and cycle.stable
+    times = cycle.period * np.array([1.0, 2.0, 50.0])
+    run = reference.trajectory(reference.of_scene(scene, y0=np.split(cycle.state, 2)), times[-1], times)
+    np.testing.assert_allclose(run.v, np.tile(cycle.state[3:], (3, 1)), atol=1e-6 * cycle.amplitude)
