@@ -73,12 +73,7 @@ def cycle_derivatives(
     names = arguments.listed_names("wrt", wrt, "mu")
     arguments.names_of_parameters("wrt", names, cycle.scene.parameters)
     arguments.truth("multipliers", multipliers)
-    for name in names:
-        if np.ndim(cycle.scene.parameters[name]):
-            raise ValueError(
-                f"Argument `wrt` must name parameters that are single numbers, but `{name}` holds one for each contact. Give "
-                f"the scene one number for all contacts."
-            )
+    arguments.single_numbers("wrt", names, cycle.scene.parameters)
     own = cycle_in_contact_coordinates(cycle)
     slopes = _slopes(own.scene, names, point_of(own), jnp.asarray(cycle.crossings, jnp.int32), bool(multipliers))
     # The parameters are the last axis.

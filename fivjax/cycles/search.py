@@ -146,8 +146,8 @@ def _kicked(scene: Scene) -> list[Trajectory]:
     if not isinstance(scene.load, Pulse) or float(scene.load.duration) <= 0:
         return []
     # Steps end there: a row at a jump of the load is the state that the kick has left behind.
-    end, pulse = float(scene.load.duration), scene.replace(start=0.0)
-    return [simulate(pulse.replace(p=float(p)), end, end, derivatives="none") for p in kicks]
+    end = float(scene.load.duration)
+    return [simulate(scene.replace(start=0.0, p=float(p)), end, end, derivatives="none") for p in kicks]
 
 
 def _at_random(scene: Scene) -> Float[np.ndarray, "m 2n"]:

@@ -197,6 +197,16 @@ def names_of_parameters(name: str, names: Collection[str], known: Iterable[str])
         )
 
 
+def single_numbers(name: str, names: Iterable[str], values: Mapping) -> None:
+    """Refuse names of parameters whose values hold a number for each contact."""
+    for one in names:
+        if np.ndim(values[one]):
+            raise ValueError(
+                f"Argument `{name}` must name parameters that are single numbers, but `{one}` holds one for each contact. "
+                f"Give the scene one number for all contacts."
+            )
+
+
 def describe(value) -> str:
     """A short description of a value for an error message."""
     if isinstance(value, str | bool | int | float | complex | type(None)):

@@ -244,11 +244,14 @@ def _versions() -> list[str]:
     return [f"{name} {one.version}" for name, those in found.items() for one in those[:1]]
 
 
+ROOT = Path(__file__).parents[1]
+
+
 def _stamps() -> list[tuple[str, int, int]]:
     """The files of fivjax's own source, with their times and sizes."""
-    root = Path(__file__).parents[1]
-    told = ((path, path.stat()) for path in sorted(root.rglob("*.py")))
-    return [(str(path.relative_to(root)), stat.st_mtime_ns, stat.st_size) for path, stat in told]
+    # Editors leave links that lead nowhere beside what they edit.
+    told = ((path, path.stat()) for path in sorted(ROOT.rglob("*.py")) if path.is_file())
+    return [(str(path.relative_to(ROOT)), stat.st_mtime_ns, stat.st_size) for path, stat in told]
 
 
 # While this module is imported, as all others are.
@@ -260,7 +263,7 @@ def _source() -> str:
     """A digest of fivjax's own source; where that was changed after it was imported, one that no other process has."""
     digest = hashlib.sha256()
     for name, *_ in IMPORTED:
-        path = Path(__file__).parents[1] / name
+        path = ROOT / name
         digest.update(name.encode() + b"\0" + (path.read_bytes() if path.exists() else b""))
     return digest.hexdigest() if _stamps() == IMPORTED else uuid.uuid4().hex
 

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def label(variable: "xr.DataArray") -> "xr.DataArray":
-    """The variable with its long name and unit."""
-    if (known := quantity_of(str(variable.name))) is not None:
+def label(variable: "xr.DataArray", known: tuple[str, str] | None = None) -> "xr.DataArray":
+    """The variable with its long name and unit: those that are given, or those of its name."""
+    if (known := known or quantity_of(str(variable.name))) is not None:
         variable.attrs.update(zip(("long_name", "units"), known, strict=True))
     return variable
 
@@ -41,7 +41,7 @@ def label(variable: "xr.DataArray") -> "xr.DataArray":
 def named(dataset: "xr.Dataset", **meanings: tuple[str, str]) -> "xr.Dataset":
     """The dataset with these long names and units of variables whose names mean something else elsewhere."""
     for name, known in meanings.items():
-        dataset[name].attrs.update(zip(("long_name", "units"), known, strict=True))
+        label(dataset[name], known)
     return dataset
 
 

@@ -105,9 +105,7 @@ def read_recording(
         unit = _unit(path, name, channel(meaning).quantity, units)
         signals[channel(meaning)] = scale * unit * _vector(path, name, found[name])
     if time is None:
-        time = next(
-            (name for name in ("t", "time", "T", *found) if name in found and name.lower() in ("t", "time")), None
-        )
+        time = next((name for name in ("t", "time", *found) if name in found and name.lower() in ("t", "time")), None)
     if own_rate is not None:
         base = float(own_rate)
     elif time is not None:

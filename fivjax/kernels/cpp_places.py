@@ -124,7 +124,9 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
     one_of_each = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     kept = [axis for axis in range(view.ndim) if axis not in one_of_each]
     found = np.empty(equation.outvars[0].aval.shape, object)
-    parts, within = {}, {}
+    parts, within, fill = {}, {}, None
+    if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
+        fill = _fill_of(equation)
     for batch in np.ndindex(places.shape[:-1]):
         starts = [of_numbers(0)] * view.ndim
         for axis, of_batch in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
@@ -132,7 +134,7 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
         for position, axis in enumerate(numbers.start_index_map):
             starts[axis] = np.asarray(places[(*batch, position)], object)
         parts[batch] = _from(writer, view, starts, sizes)
-        if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
+        if fill is not None:
             within[batch] = _is_within(writer, starts, np.subtract(view.shape, sizes).tolist())
     for place in np.ndindex(found.shape):
         batch = tuple(at for axis, at in enumerate(place) if axis not in numbers.offset_dims)
@@ -140,8 +142,7 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
         index = tuple(own.get(axis, 0) for axis in range(view.ndim))
         part = parts[batch]
         found[place] = part.at(index) if isinstance(part, View) else part[index]
-        if batch in within:
-            fill = fill_of(equation)
+        if fill is not None:
             found[place] = writer.one("select_n", CHOICE, [within[batch], fill, found[place]], kind)
     return found
 
@@ -160,7 +161,7 @@ def _is_within(writer: Writer, starts, most: list[int]):
     return held
 
 
-def fill_of(equation):
+def _fill_of(equation):
     """The number that JAX gives for places outside of an array."""
     value, dtype = equation.params["fill_value"], equation.outvars[0].aval.dtype
     if value is not None:

@@ -141,7 +141,7 @@ class InitialStates:
         size, shapes = np.inf, []
         for shares, margin, _ in self.sliding.margins:
             rows = np.asarray(shares)[:, None] * to_modal
-            sizes, vectors = _later(rows, rates, step, 0.0, lambda rows: np.linalg.norm(rows, axis=-1))
+            sizes, vectors = _later(rows, rates, step, lambda rows: np.linalg.norm(rows, axis=-1))
             size = min(size, margin / (float(np.max(sizes)) * np.exp(growth * step)))
             chosen = vectors[_highest(sizes)]
             shapes.append(-(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)) @ self.root.T)
@@ -212,8 +212,8 @@ class Histories:
             until = np.exp(np.outer(rates, self.time - edges))
             rows = own[:, None] * (until[:, 1:] - until[:, :-1])
             step = 2 * np.pi / (COARSE * fastest)
-            sizes, later = _later(rows, rates, step, 0.0, _sum_of_sizes)
-            bends, _ = _later(rows * rates[:, None] ** 2, rates, step, 0.0, _sum_of_sizes)
+            sizes, later = _later(rows, rates, step, _sum_of_sizes)
+            bends, _ = _later(rows * rates[:, None] ** 2, rates, step, _sum_of_sizes)
             crude = float(np.sum(np.abs(rows) * np.abs(rates[:, None]) ** 4))
             size = min(size, margin / max(peak, _peak(sizes, bends, crude, step)))
             for values, rows in ((during, vectors), (sizes, later)):
@@ -241,16 +241,16 @@ def _sum_of_sizes(rows: np.ndarray) -> np.ndarray:
     return np.sum(np.abs(rows), axis=-1)
 
 
-def _later(rows: np.ndarray, rates: np.ndarray, step: float, begin: float, norm) -> tuple[np.ndarray, np.ndarray]:
-    """Responses and their norms at equally spaced instants from `begin` on, until later ones must be smaller than these."""
-    whole = float(np.sum(norm(np.abs(rows)) * np.exp(rates.real * begin)))
+def _later(rows: np.ndarray, rates: np.ndarray, step: float, norm) -> tuple[np.ndarray, np.ndarray]:
+    """Responses and their norms at equally spaced instants from zero on, until later ones must be smaller than these."""
+    whole = float(np.sum(norm(np.abs(rows))))
     sizes, vectors, most, count = [], [], 0.0, 0
     while not count or np.max(np.exp(rates.real * step * count)) * whole >= most:
         if count > MOST_INSTANTS:
             raise ValueError(
                 "Steady sliding decays too slowly here for a certified bound. Go further from the critical friction."
             )
-        t = begin + step * np.arange(count, count + CHUNK)
+        t = step * np.arange(count, count + CHUNK)
         found = np.real(np.exp(np.outer(t, rates)) @ rows)
         vectors.append(found)
         sizes.append(norm(found))

@@ -92,7 +92,7 @@ def raise_critical_friction(
     **Raises:** `ValueError` for unknown names, bounds that do not contain the structure's own value, and a structure without
     critical friction.
     """
-    within = _checked_bounds(structure, bounds, tied or {})
+    within = _checked_bounds(structure, bounds, tied)
     if target is not None:
         arguments.real_number("target", target, above=0)
 

@@ -199,11 +199,12 @@ def attractor_columns(count: int, attractor: dict[int, CapturingSet], chaotic: n
     kind = np.where(chaotic, CHAOTIC, NO_ATTRACTOR).astype(np.int8)
     told = ("amplitude", "period", "reach", "contraction", "multiplier", "position")
     numbers = dict(zip(told, np.full((len(told), count), np.nan), strict=True))
-    captors, rows_of = {id(captor): captor for captor in attractor.values()}, defaultdict(list)
+    rows_of = defaultdict(list)
     for row, captor in attractor.items():
         rows_of[id(captor)].append(row)
-    for key, captor in captors.items():
-        one, rows = captor.cycle if isinstance(captor, Approach) else captor, rows_of[key]
+    for rows in rows_of.values():
+        captor = attractor[rows[0]]
+        one = captor.cycle if isinstance(captor, Approach) else captor
         kind[rows] = APPROACHED if one is not captor else TORUS if isinstance(one, Torus) else PERIODIC
         for name in told:
             numbers[name][rows] = getattr(one, name, np.nan)

@@ -81,12 +81,7 @@ class Explorer:
             )
         self._map = None if dataset is None else MapPicture(dataset, scene)
         axes = {} if self._map is None else self._map.values
-        shaped = [name for name in ranges if np.ndim(scene.parameters[name])]
-        if shaped:
-            raise ValueError(
-                f"Argument `ranges` must name parameters that are single numbers, but `{shaped[0]}` holds one for each "
-                f"contact. Give the scene one number for all contacts."
-            )
+        arguments.single_numbers("ranges", ranges, scene.parameters)
         self._exact = {name: float(scene.parameters[name]) for name in parameters_shown(scene, {**ranges, **axes})}
         self.sliders = {name: slider(widgets, name, value, ranges, axes) for name, value in self._exact.items()}
         self._panels = drawing_panels(t1, len(scene.structure.contacts))
