@@ -80,10 +80,15 @@ def _checked(structure: Structure, direction) -> Structure:
     own = in_contact_coordinates(structure)
     if all(map(is_known, own.matrices)):
         free, (tangential, _) = free_in_sliding(own), contact_coordinates(own)
-        # The motion without friction, and what a unit of it would move.
-        squares, modes = linalg.eigh(*(np.asarray(matrix)[np.ix_(free, free)] for matrix in (own.stiffness, own.mass)))
-        moved = np.abs(modes[np.isin(free, tangential)]).max(axis=0)
-        if np.any((squares < 1e-12 * squares[-1]) & (moved > 1e-9 * np.abs(modes).max(axis=0))):
+        # What no spring holds, and what a unit of it would move. In units that give each coordinate a stiffness of one, a very
+        # stiff one does not make others seem free.
+        stiffness = np.asarray(own.stiffness)[np.ix_(free, free)]
+        sizes = np.abs(np.diag(stiffness))
+        units = 1 / np.sqrt(np.where(sizes > 0, sizes, 1.0))
+        held, motions = linalg.eigh(units[:, None] * stiffness * units)
+        motions = units[:, None] * motions
+        moved = np.abs(motions[np.isin(free, tangential)]).max(axis=0)
+        if np.any((held < 1e-12) & (moved > 1e-9 * np.abs(motions).max(axis=0))):
             raise ValueError(
                 "There is no steady sliding: friction moves a part of the structure that no spring holds. "
                 "Hold it by a spring along the belt."

@@ -22,7 +22,7 @@ from jaxtyping import Array, Complex, Float
 from ..foundation.linear_solve import inverse, solve
 from ..foundation.matrix_routines import eigenvalues
 from .feedback import Loop
-from .gradients import significant_growth
+from .gradients import in_natural_units, significant_growth
 from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER, PAINLEVE
 
 
@@ -54,8 +54,8 @@ def first_limit(loop: Loop) -> Limit:
     chained = jnp.block([[-stiffness, eye], [none, -stiffness]])
     chained_output = jnp.concatenate([row_position, jnp.zeros(m)])
     input_ = jnp.concatenate([jnp.zeros(m), column])
-    squares = jax.vmap(_zeros, in_axes=(0, None, 0))(
-        jnp.stack([squared, chained]), input_, jnp.stack([output, chained_output])
+    squares = jax.vmap(_zeros, in_axes=(0, None, 0, None))(
+        jnp.stack([squared, chained]), input_, jnp.stack([output, chained_output]), _scales(stiffness)
     ).ravel()
     omega = jnp.sqrt(jnp.maximum(-squares.real, 0.0))
     inverse_gain = jax.vmap(lambda w: loop(1j * w).real)(omega)
@@ -63,14 +63,16 @@ def first_limit(loop: Loop) -> Limit:
     inverse_gain = jnp.where(real_frequency, inverse_gain, 0.0)
     inverse_gain = jnp.concatenate([inverse_gain, jnp.stack([static, impulsive])])
     omega = jnp.concatenate([omega, jnp.array([0.0, jnp.inf])])
-    codes = jnp.array([FLUTTER] * (2 * m) + [COALESCENCE] * (2 * m) + [DIVERGENCE, PAINLEVE], jnp.int32)
+    each = squares.size // 2
+    codes = jnp.array([FLUTTER] * each + [COALESCENCE] * each + [DIVERGENCE, PAINLEVE], jnp.int32)
     state = jnp.block([[none, eye], [-stiffness, -damping]])
     row = jnp.concatenate([row_position, row_velocity])
     typical = 1 / (jnp.abs(impulsive) + jnp.linalg.norm(row) * jnp.linalg.norm(column))
     typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
     usable = jnp.isfinite(inverse_gain) & (inverse_gain > 0)
     # A mode without damping lies on the imaginary axis already at gain zero, which is no crossing.
-    marginal = jnp.max(eigenvalues(state).real) > -1e-11
+    values = eigenvalues(in_natural_units(state, 1.0))
+    marginal = jnp.any(values.real > -1e-11 * jnp.abs(values))
     usable = usable & ~(marginal & (codes == FLUTTER) & (inverse_gain * typical > 1e5))
     # With damping, undamped modes that meet say nothing; but they may do so at the very gain of a crossing: where it is equal.
     usable = usable & (marginal | (codes != COALESCENCE))
@@ -82,11 +84,11 @@ def first_limit(loop: Loop) -> Limit:
     lower = jnp.concatenate([jnp.zeros(1), gains])
     upper = jnp.concatenate([gains, jnp.array([jnp.inf])])
     between = jnp.minimum(0.5 * (lower + upper), jnp.maximum(2 * lower, typical))
-    empty = ~jnp.isfinite(lower) | (upper <= lower * (1 + 1e-12))
+    empty = ~jnp.isfinite(lower) | (upper <= lower * (1 + 1e-11))
 
     def unstable(gain):
         closed = state + jnp.outer(input_, row) * gain / (1 - gain * impulsive)
-        return significant_growth(closed) > 0
+        return significant_growth(in_natural_units(closed, 1.0)) > 0
 
     def not_found(carry):
         i, found = carry
@@ -145,24 +147,42 @@ def _(primals, tangents):
     return limit, tangent
 
 
-def _zeros(matrix: Float[Array, "n n"], column: Float[Array, " n"], row: Float[Array, " n"]) -> Complex[Array, " n"]:
-    """The zeros x of row (x - matrix)⁻¹ column: at most n - 1; the others come out infinite."""
+def _scales(stiffness: Float[Array, "m m"]) -> Float[Array, " 3"]:
+    """Typical squares of frequencies: of the slowest coordinate, the middle, and of the fastest."""
+    squares = jnp.abs(jnp.diagonal(stiffness))
+    moving = squares > 0
+    logarithms = jnp.log(jnp.where(moving, squares, 1.0))
+    middle = jnp.sum(logarithms) / jnp.maximum(jnp.sum(moving), 1)
+    ends = [jnp.min(jnp.where(moving, logarithms, jnp.inf)), middle, jnp.max(jnp.where(moving, logarithms, -jnp.inf))]
+    return jnp.exp(jnp.where(jnp.any(moving), jnp.stack(ends), 0.0))
+
+
+def _zeros(
+    matrix: Float[Array, "n n"], column: Float[Array, " n"], row: Float[Array, " n"], scales: Float[Array, " k"]
+) -> Complex[Array, "k n"]:
+    """The zeros x of row (x - matrix)⁻¹ column, at most n - 1, as they are found about each scale; others come out infinite.
+
+    About a scale those of its size come out with all their digits, and those that are far smaller with none.
+    """
     # After shift and inversion, the zeros are eigenvalues of the matrix times the projector that removes the column. The shift
     # must not be a zero or an eigenvalue; the best of three is taken.
     n = matrix.shape[0]
-    shifts = np.array([0.3719, 1.7133, 5.2917])
 
-    def zeros_about(shift):
+    def projected_about(shift):
         inverted = inverse(matrix - shift * np.eye(n))
         seen = row @ inverted
         through = seen @ column
         quality = jnp.abs(through) / (jnp.linalg.norm(seen) * jnp.linalg.norm(column))
-        projected = inverted - jnp.outer(column, seen @ inverted) / through
+        projected = shift * (inverted - jnp.outer(column, seen @ inverted) / through)
         return projected, jnp.where(jnp.all(jnp.isfinite(projected)), quality, 0.0)
 
-    projected, quality = jax.vmap(zeros_about)(shifts)
-    # The first of the best. For a loop that is zero or undamped none is usable, and the result is not finite.
-    chosen = (quality > 0) & (quality == jnp.max(quality))
-    chosen = chosen & (jnp.cumsum(chosen) == 1)
-    best = jnp.sum(jnp.where(chosen[:, None, None], projected, 0.0), axis=0)
-    return jnp.sum(jnp.where(chosen, shifts, 0.0)) + 1 / eigenvalues(best)
+    def zeros_about(scale):
+        shifts = scale * np.array([0.3719, 1.7133, 5.2917])
+        projected, quality = jax.vmap(projected_about)(shifts)
+        # The first of the best. For a loop that is zero or undamped none is usable, and the result is not finite.
+        chosen = (quality > 0) & (quality == jnp.max(quality))
+        chosen = chosen & (jnp.cumsum(chosen) == 1)
+        best = jnp.sum(jnp.where(chosen[:, None, None], projected, 0.0), axis=0)
+        return jnp.sum(jnp.where(chosen, shifts, 0.0)) * (1 + 1 / eigenvalues(best))
+
+    return jax.vmap(zeros_about)(scales)

@@ -180,14 +180,16 @@ def _all(pencil: Pencil, band: float):
     from scipy.linalg import eig
 
     mass, damping, stiffness = (matrix.toarray() for matrix in (pencil.mass, pencil.damping, pencil.stiffness))
-    n, eye = pencil.size, np.eye(pencil.size)
-    unit = _unit(mass, stiffness)
-    # In units of a typical frequency, so that both halves of a state are of similar size.
-    state = np.block([[np.zeros((n, n)), eye], [-stiffness / unit**2, -damping / unit]])
-    inertia = np.block([[eye, np.zeros((n, n))], [np.zeros((n, n)), mass]])
+    n, none = pencil.size, np.zeros((pencil.size, pencil.size))
+    frequencies, sizes = _natural_units(mass, stiffness)
+    mass, damping, stiffness = (sizes[:, None] * matrix * sizes for matrix in (mass, damping, stiffness))
+    # Displacements times frequencies, so that both halves of a state are of similar size; time in units of a typical one.
+    unit = np.exp(np.mean(np.log(frequencies)))
+    state = np.block([[none, np.diag(frequencies)], [-stiffness / frequencies, -damping]]) / unit
+    inertia = np.block([[np.eye(n), none], [none, mass]])
     (top, bottom), vectors = eig(state, inertia, homogeneous_eigvals=True)  # pyright: ignore[reportAssignmentType]
     finite = np.abs(bottom) > 1e-14 * np.abs(top)
-    values, shapes = unit * top[finite] / bottom[finite], vectors[:n, finite]
+    values, shapes = unit * top[finite] / bottom[finite], (sizes / frequencies)[:, None] * vectors[:n, finite]
     # LAPACK's routine for real matrices gives exactly real eigenvalues, and exact pairs.
     values = _round_off(pencil, values, shapes)
     chosen = np.flatnonzero((values.imag >= 0) & (values.imag <= band))
@@ -195,9 +197,18 @@ def _all(pencil: Pencil, band: float):
     return values[chosen], shapes[:, chosen], np.inf
 
 
-def _unit(mass: np.ndarray, stiffness: np.ndarray) -> float:
-    sizes = [np.linalg.norm(matrix) for matrix in (stiffness, mass)]
-    return float(np.sqrt(sizes[0] / sizes[1])) if min(sizes) > 0 else 1.0
+def _natural_units(mass: np.ndarray, stiffness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A frequency (rad/s) and a size of displacement for each coordinate, with which its mass is one.
+
+    What has no mass or no spring has the frequency of the others.
+    """
+    mass, stiffness = np.abs(np.diag(mass)), np.abs(np.diag(stiffness))
+    both = (mass > 0) & (stiffness > 0)
+    squares = np.divide(stiffness, mass, out=np.ones_like(mass), where=both)
+    usual = np.exp(np.mean(np.log(squares[both]))) if np.any(both) else 1.0
+    squares = np.where(both, squares, usual)
+    inertia = np.where(mass > 0, mass, stiffness / usual)
+    return np.sqrt(squares), 1 / np.sqrt(np.where(inertia > 0, inertia, 1.0))
 
 
 def _in_band(pencil: Pencil, band: float):

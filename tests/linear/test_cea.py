@@ -722,6 +722,34 @@ def test_a_free_mass_beside_it_does_not_hide_divergence():
     assert slopes["stiffness[0,1]"] == pytest.approx(-0.25, rel=1e-9)
 
 
+def with_a_stiff_coordinate(ratio: float, *, damping: float, coupling: float) -> fj.Structure:
+    """The paper's structure and a mass on its first coordinate by a spring: in frequency so many times above the structure."""
+    own = belt()
+    mass, _, stiffness, load = (np.asarray(matrix) for matrix in own.matrices)
+    frequency = ratio * np.sqrt(np.trace(stiffness) / np.trace(mass))
+    added = [1.0, 2 * damping * frequency, frequency**2]
+    matrices = [
+        np.block([[np.asarray(m), np.zeros((len(m), 1))], [np.zeros(len(m)), a]])
+        for m, a in zip(own.matrices[:3], added, strict=True)
+    ]
+    matrices[2][0, -1] = matrices[2][-1, 0] = coupling * stiffness[0, 0]
+    return fj.Structure(*matrices, np.append(load, 0.0), contacts=own.contacts)
+
+
+@pytest.mark.parametrize("ratio", [1e-6, 1e5, 1e7])
+@pytest.mark.parametrize(("damping", "coupling"), [(0.0, 0.0), (0.3, 0.0), (0.01, 0.4)])
+def test_a_far_stiffer_or_softer_coordinate_changes_no_limit(ratio, damping, coupling):
+    """A spring that couples it adds coupling² k₁₁² / k to the stiffness, which is of the order of 1 / ratio²."""
+    stiff = with_a_stiff_coordinate(ratio, damping=damping, coupling=coupling if ratio > 1 else 0.0)
+    limit = fj.cea.stability_limit(stiff)
+    assert limit.mu == pytest.approx(MU_CRIT, rel=1e-8)
+    assert limit.mechanism is Mechanism.FLUTTER
+    assert float(fj.cea.critical_friction(stiff)) == limit.mu
+    growing = fj.cea.complex_modes(stiff, 0.3)
+    (place,) = growing.unstable
+    assert growing.growth_rates[place] == pytest.approx(fj.cea.growth_rate(belt(), 0.3), rel=1e-6)
+
+
 def test_what_friction_moves_ever_further_has_no_limit_of_steady_sliding():
     for limit_of in (fj.cea.critical_friction, fj.cea.stability_limit):
         with pytest.raises(ValueError, match="friction moves a part of the structure that no spring holds"):

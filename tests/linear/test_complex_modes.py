@@ -124,6 +124,18 @@ def test_dense_modes_of_unsymmetric_matrices():
     np.testing.assert_allclose(fj.cea.complex_modes(massless).eigenvalues, [1j * np.sqrt(2)], atol=1e-12)
 
 
+@pytest.mark.parametrize("mass", [1e-12, 1e-9, 1e12])
+def test_units_of_mass_take_no_digits(mass):
+    """Lightly damped modes: a rounding error of their frequencies would be far larger than their growth rates."""
+    frequencies, ratio = np.array([10.0, 3e3, 1e6]), 1e-7
+    turn, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    matrices = [turn * (mass * entries) @ turn.T for entries in (np.ones(3), 2 * ratio * frequencies, frequencies**2)]
+    matrices[0] = mass * np.eye(3)
+    modes = fj.cea.complex_modes(fj.cea.Pencil(*matrices))
+    np.testing.assert_allclose(modes.eigenvalues.imag[1:], frequencies[1:], rtol=1e-9)
+    np.testing.assert_allclose(modes.damping_ratios[1:], ratio, rtol=1e-3)
+
+
 @pytest.mark.parametrize("direction", [1, -1])
 def test_one_contact_is_what_it_was(direction):
     """The sliding pencil of the belt oscillator has the eigenvalues of `cea.eigenvalues`, which come from the contact forces."""

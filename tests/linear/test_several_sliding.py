@@ -37,6 +37,16 @@ def test_two_copies_are_two_copies():
     np.testing.assert_allclose(both, np.repeat(single, 2), rtol=1e-9)
 
 
+@pytest.mark.parametrize("ratio", [1e-6, 1e5, 1e7])
+def test_a_far_stiffer_or_softer_coordinate_changes_no_limit(ratio):
+    pair = coupled(2e4, 1.05)
+    mass, damping, stiffness, load = map(np.asarray, pair.matrices)
+    added = 1.0, 0.02 * ratio * 1e3, (ratio * 1e3) ** 2
+    matrices = [linalg.block_diag(m, a) for m, a in zip((mass, damping, stiffness), added, strict=True)]
+    limit = fj.cea.stability_limit(fj.Structure(*matrices, np.append(load, 0.0), contacts=pair.contacts))
+    assert limit.mu == pytest.approx(fj.cea.critical_friction(pair), rel=1e-8)
+
+
 def test_critical_friction_is_where_growth_begins_and_moves_as_differences_say():
     """Of coupled contacts: growth on one side only, and the sensitivities are those of differences."""
     pair = coupled(2e4, 1.05)
