@@ -237,9 +237,6 @@ def enter(
     loss = jnp.where(jnp.any(landed), loss, 0.0)
     dissipated = jnp.where(jnp.any(landed), loss + _sum(mechanics, by_belt), 0.0)
     bounced = landed & (following == Status.DETACH) & (after.h > 0)
-    reversed_ = (status == following) & (contact.direction != after.contact.direction)
-    reversed_ = reversed_ & (status == Status.SLIDE)
-    happened = (following != status) | bounced | reversed_
     by_contact = {}
     if mechanics.several:
         # Impulses act only at the contacts, so each contact has its own part of the loss.
@@ -257,7 +254,7 @@ def enter(
         impact_dissipated=ledger.impact_dissipated + dissipated,
         stick_time=ledger.stick_time + jnp.where(_all(mechanics, sticks), after.h, 0.0),
         detach_time=ledger.detach_time + jnp.where(_all(mechanics, detached), after.h, 0.0),
-        events=ledger.events + (jnp.sum(happened, dtype=jnp.int32) if mechanics.several else happened),
+        events=ledger.events + _changes(mechanics, contact, after.contact, bounced),
         crossings=ledger.crossings + rise_between(mechanics, y, after.end, after.y).happened,
         beyond_rest=ledger.beyond_rest + beyond_rest,
         start=ledger.start,
@@ -266,6 +263,18 @@ def enter(
     )
     open_ = jax.lax.stop_gradient(jnp.abs(residual(energy_data, entered, after.y)))
     return eqx.tree_at(lambda ledger: ledger.worst, entered, jnp.maximum(ledger.worst, open_))
+
+
+def at_transition(mechanics: Mechanics, ledger: Ledger, before: Contact, after: Contact) -> Ledger:
+    """The ledger after a change of the contact mode that a jump of the load demands at once: no work, but an event."""
+    return eqx.tree_at(lambda ledger: ledger.events, ledger, ledger.events + _changes(mechanics, before, after, False))
+
+
+def _changes(mechanics: Mechanics, before: Contact, after: Contact, bounced) -> Array:
+    """How many contacts have an event between two modes."""
+    reversed_ = (before.status == Status.SLIDE) & (before.direction != after.direction)
+    happened = (before.status != after.status) | bounced | reversed_
+    return jnp.sum(happened, dtype=jnp.int32) if mechanics.several else happened
 
 
 def entered(

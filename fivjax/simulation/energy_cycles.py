@@ -30,6 +30,7 @@ from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 from . import energy as accounts
 from .energy import Energy, EnergyData, Ledger
+from .rows import after_jump
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -218,6 +219,11 @@ def _find(args, numbers: Float[Array, " most"]):
 
         nothing_yet = start, start.contact.status, jnp.zeros((), bool)
         found, before, _ = jax.lax.while_loop(going, lambda carry: stretch(carry[0]), nothing_yet)
+        # A row at a jump of the load has counted the event that it demands at once.
+        now = of_events & (count(found.ledger) < count(begin.ledger) + number) & jnp.any(found.t == scene.load.jumps)
+        after, ledger = after_jump(mechanics, found.contact, found.ledger, scene.load(found.t), found.y, now)
+        before = jnp.where(count(ledger) > count(found.ledger), found.contact.status, before)
+        found = found._replace(contact=after, ledger=ledger)
         return found, (found, before)
 
     _, rows = jax.lax.scan(to_next, depending_on((scene, begin, end), begin), numbers)

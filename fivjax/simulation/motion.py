@@ -26,7 +26,7 @@ from . import energy as accounts
 from .ending import Ending
 from .energy import EnergyData, Ledger
 from .jump_instants import StartOfRun, start_of_run
-from .rows import contact_after_jump, grown, row_of
+from .rows import after_jump, grown, row_of
 from .start import at_equilibrium
 
 
@@ -127,7 +127,7 @@ def _followed(args, instants, method: EventExact):
         )
         # A row at a jump of the load shows the load and the contact just after it.
         on_jump = jnp.any(instant == scene.load.jumps) & (instant > instants_begin)
-        contact = contact_after_jump(mechanics, now.contact, load, y, on_jump)
+        contact, ledger = after_jump(mechanics, now.contact, ledger, load, y, on_jump)
         row = row_of(mechanics, energy_data, contact, load, y, ledger, lost)
         now = now._replace(highest=highest, count=jnp.zeros_like(now.count), events=jnp.zeros_like(now.events))
         return (now, lost, ending), row

@@ -127,7 +127,7 @@ def _rows(scene: Scene, start: State, saved, states, energy_data, highest=0.0, e
     y = jnp.where(kept[:, None], y, jnp.nan)
     # A row at a jump of the load shows the load and the contact just after it.
     on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
-    contacts = jax.vmap(lambda c, f, x, now: contact_after_jump(mechanics, c, f, x, now))(contacts, load, y, on_jump)
+    contacts, ledgers = jax.vmap(lambda *own: after_jump(mechanics, *own))(contacts, ledgers, load, y, on_jump)
     rows = jax.vmap(lambda *own: row_of(mechanics, energy_data, *own))(contacts, load, y, ledgers, ~kept)
     return {"t": saved, **rows, "status": rows["status"].astype(jnp.int8), "grown": unbounded}
 
@@ -175,14 +175,17 @@ def grown(scene: Scene, start: State, t: Float[Array, ""], highest: Float[Array,
     return jnp.max(jnp.abs(weights * y)) > UNBOUNDED_FROM * expected
 
 
-def contact_after_jump(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
-    """The contact mode after a jump of the load, if there is a jump `now`."""
+def after_jump(
+    mechanics: Mechanics, contact: Contact, ledger: Ledger | None, load: Float[Array, ""], y: State, now
+) -> tuple[Contact, Ledger | None]:
+    """The contact mode after a jump of the load, if there is a jump `now`, and the ledger with that event."""
 
     def after() -> Contact:
         ended = physics.guards(mechanics, contact, load, y) < 0
         return physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))[0]
 
-    return jax.lax.cond(now, after, lambda: contact)
+    following = jax.lax.cond(now, after, lambda: contact)
+    return following, None if ledger is None else accounts.at_transition(mechanics, ledger, contact, following)
 
 
 def states_at(
