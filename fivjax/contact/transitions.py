@@ -140,7 +140,10 @@ def _following(
         following = Contact(status, jnp.where(reached, following.direction, contact.direction))
     else:
         y_next = jnp.where(touched, struck(), y_stopped)
-        following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK)
+        held = contact.status == Status.STICK
+        # Where no force is in the contact yet, the edge of the cone that has ended says where it is pushed.
+        edge = jnp.where(held & ended[1], -1.0, 1.0).astype(y.dtype)
+        following = status_from_forces(mechanics, load, y_next, may_stick=~held, pushed=edge)
         status = jnp.where(lifted, Status.DETACH, following.status)
         rests = touched & (status != Status.DETACH)
         following = Contact(status.astype(contact.status.dtype), following.direction)
@@ -157,13 +160,18 @@ def _following(
 
 
 def status_from_forces(
-    mechanics: Mechanics, load: Float[Array, ""], y: State, may_stick: Bool[Array, ""] | bool = True
+    mechanics: Mechanics,
+    load: Float[Array, ""],
+    y: State,
+    may_stick: Bool[Array, ""] | bool = True,
+    pushed: Float[Array, ""] | float = 1.0,
 ) -> Contact:
     """The status of a state on its constraints, found from the forces that each status would need.
 
     Gap open or opening: detached. Slipping: sliding if pressed, or if no force is in the contact yet, else detached. At rest on
     the belt: sticking if the force that this needs lies in the friction cone, else sliding the way it is pushed, else detached.
-    With several contacts, all are found at once (`contact_problem`).
+    Without any force it sticks, too; where it may not, `pushed` is the direction of friction. With several contacts, all are
+    found at once (`contact_problem`).
     """
     if mechanics.several:
         return modes_from_forces(mechanics, load, y)
@@ -173,9 +181,10 @@ def status_from_forces(
     holds = sticking_forces(mechanics, free)
     held = jnp.all(cone_margins(mechanics, *holds) >= 0)
     holding, pressing = total_forces(mechanics, *holds)
-    sticks = may_stick & (slip == 0) & (pressing > 0) & held
-    pushed = jnp.where(slip == 0, jnp.sign(holding), -jnp.sign(slip))
-    direction = jnp.where(pushed == 0, 1.0, pushed).astype(y.dtype)
+    free_of_force = (pressing == 0) & (holding == 0)
+    sticks = may_stick & (slip == 0) & held & ((pressing > 0) | free_of_force)
+    along = jnp.where(slip == 0, jnp.sign(holding), -jnp.sign(slip))
+    direction = jnp.where(along == 0, pushed, along).astype(y.dtype)
     sliding = Contact(jnp.full_like(open_, Status.SLIDE, jnp.int32), direction)
     forces = ModeForces(mechanics, sliding, mechanics.friction(jnp.abs(slip))).added(mechanics, free)
     _, sliding_normal_force = total_forces(mechanics, *forces)

@@ -293,6 +293,22 @@ def test_signs(squeal):
     np.testing.assert_allclose(sum(energy.work.dampers.values()), energy.work.damping, rtol=1e-12)
 
 
+@pytest.mark.parametrize("p", [0.0, 8.0])
+def test_an_event_at_a_jump_of_the_load_is_in_the_table_whether_or_not_a_row_is_there(p):
+    """The load acts on the mass in contact: where the kick begins it lifts off, and where it ends it slips, at once."""
+    structure = fj.Structure(np.eye(2), np.diag([2.0, 30.0]), [[1e4, -2e3], [-2e3, 2e4]], [0.0, -1.0], 0, 1)
+    kick = fj.Pulse(p=p, duration=0.125, start=0.125)
+    scene = fj.Scene(structure, fj.Coulomb(0.5, mu_static=0.8), belt_speed=0.02, load=kick)
+    on_rows, beside_rows = (fj.simulate(scene, 0.4, 1 / rate, energy=True) for rate in (1024, 1000.7))
+    tables = [fj.energy_per_event(run) for run in (on_rows, beside_rows)]
+    for own, other in zip(tables[0].data_vars.values(), tables[1].data_vars.values(), strict=True):
+        np.testing.assert_allclose(own, other, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(tables[0].event_time, tables[1].event_time, rtol=0, atol=1e-12)
+    assert 0.125 + 0.125 * (p == 8.0) in tables[0].event_time
+    row = np.searchsorted(on_rows.t, 0.125 + 0.125 * (p == 8.0))
+    assert on_rows.energy.ledger.events[row] == on_rows.energy.ledger.events[row - 1] + 1
+
+
 @pytest.mark.slow
 def test_impacts_seen_from_the_belt_never_gain():
     """The belt moves, so an impact may leave the structure with more energy than before; but not what the two have together."""

@@ -4,6 +4,7 @@ import diffrax
 import jax
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import fivjax as fj
 from fivjax.contact import Status
@@ -299,6 +300,37 @@ def test_an_undeformed_structure_at_rest_is_pressed_a_moment_later():
     expected = oracle.propagate(model, 0.05, y0=(np.zeros(3), np.zeros(3)))
     np.testing.assert_allclose(run.displacement[-1], expected.q[-1], atol=1e-9 * np.abs(expected.q[-1]).max())
     np.testing.assert_allclose(run.velocity[-1], expected.v[-1], atol=1e-9 * np.abs(expected.v[-1]).max())
+
+
+@pytest.mark.parametrize("mu", [0.05, 0.5])
+@pytest.mark.parametrize("angle", [1.2, -1.2])
+def test_an_undeformed_structure_on_a_belt_at_rest_slips_the_way_it_is_pushed(mu, angle):
+    """The load reaches the contact by an inclined spring: no force is in it at first, then one outside of the cone."""
+    inclined = np.array([np.sin(angle), np.cos(angle), -np.cos(angle)])
+    stiffness = np.diag([1e4, 2e3, 5e3]) + 5e4 * np.outer(inclined, inclined)
+    mass, load = np.diag([1.0, 1.0, 0.5]), np.array([0.0, 0.0, -1.0])
+    damping = 2.0 * mass + 2e-4 * stiffness
+    structure = fj.Structure(mass, damping, stiffness, load, 0, 1)
+    run = fj.simulate(fj.Scene(structure, fj.Coulomb(mu), 0.0, fj.ConstantLoad(100.0)), 8e-3, 1e-3, y0=np.zeros(6))
+    assert run.outcome == fj.Ending.FINISHED
+
+    def sliding(_, state):
+        """With two coordinates left, friction is in proportion to what presses the contact."""
+        x, z, *rates = state
+        forces = 100.0 * load - stiffness @ [x, 0.0, z] - damping @ [rates[0], 0.0, rates[1]]
+        friction = mu * -forces[1] * np.sign(angle)
+        return [*rates, forces[0] + friction, forces[2] / 0.5]
+
+    expected = solve_ivp(sliding, (0.0, 8e-3), np.zeros(4), t_eval=run.t, rtol=1e-11, atol=1e-16).y
+    np.testing.assert_allclose(run.displacement[:, [0, 2]], expected[:2].T, rtol=1e-8, atol=1e-14)
+    assert np.abs(expected[0, -1]) > 1e-4 and np.all(run.status[1:] == Status.SLIDE)
+
+
+def test_what_no_load_presses_stays_where_it_is():
+    resting = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.3), 0.0, fj.Pulse(100.0, 0.0, duration=0.01))
+    run = fj.simulate(resting, 0.02, 1e-3, y0=np.zeros(6))
+    assert run.outcome == fj.Ending.FINISHED and np.all(run.status == Status.STICK)
+    assert np.all(run.displacement[:11] == 0) and run.displacement[-1, 1] < -1e-5
 
 
 def test_a_batch_of_trajectories_is_refused_where_one_is_asked_for(paper_scene):
