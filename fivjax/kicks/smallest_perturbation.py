@@ -171,6 +171,12 @@ def smallest_of(kind: InitialStates | Histories) -> SmallestPerturbation:
     """The perturbation of this kind with the least norm that leads to a limit cycle."""
     certificate, rays = kind.certificate(), _Rays(kind)
     shapes = certificate.shapes
+    if certificate.size >= kind.most:
+        raise NoSquealingKick(
+            f"No history of this duration leads to a limit cycle: beyond {kind.most:g} the load would have to pull. Give a "
+            f"longer one.",
+            certificate.size,
+        )
     largest = min(FARTHEST * certificate.size, kind.most)
     sizes = np.tile(np.linspace(0.99 * certificate.size, largest, SCANNED), (len(shapes), 1))
     found = rays.first(shapes, sizes, ROUGH)

@@ -95,6 +95,12 @@ def _check_axes(dataset: xr.Dataset, names: tuple[str, ...]) -> None:
             "A map picture needs an axis or two, but this map has none. Give `fj.bistability_map` one, such as "
             "`p=np.linspace(1, 4, 64)`."
         )
+    for name in names:
+        if name not in dataset.coords or dataset[name].dtype == object:
+            raise ValueError(
+                f"A map picture needs numbers along its axes, but `{name}` has none. A map that was stacked is drawn as it was "
+                f"before: `m.unstack()`."
+            )
     if len(names) > 2:
         chosen = ", ".join(f"{name}=0" for name in names[2:])
         raise ValueError(

@@ -180,6 +180,12 @@ def test_states_and_histories_are_refused_what_they_do_not_have():
         fj.smallest_kick(SCENE, over="history", bounds={"p": (1.0, 2.0)})
 
 
+def test_histories_too_short_to_squeal_are_told_by_the_certificate():
+    with pytest.raises(fj.NoSquealingKick, match="beyond 1 the load would have to pull") as none:
+        fj.smallest_kick(SCENE, over="history", bounds={"duration": (0.0, 1e-5)})
+    assert none.value.certified > 1.0
+
+
 def test_where_the_least_kick_of_the_bounds_squeals_it_is_the_smallest_and_none_below_it_is_proved():
     found = fj.smallest_kick(SCENE, over=("p",), bounds={"p": (3.0, 4.0)})
     assert found.p == found.proved_high == 3.0 and np.isnan(found.proved_low)

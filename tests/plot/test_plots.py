@@ -292,6 +292,13 @@ def test_a_map_over_one_axis_is_a_curve_of_what_is_reached():
 # --- refusals
 
 
+def test_a_stacked_map_is_drawn_unstacked():
+    with pytest.raises(
+        ValueError, match=r"`point` has none. A map that was stacked is drawn as it was before: `m.unstack\(\)`"
+    ):
+        plot.bistability(a_map().stack(point=["mu", "p"]))
+
+
 def test_a_slice_of_a_map_is_selected_by_the_call_that_the_sentence_gives():
     """Three axes: the call in the sentence is carried out, and draws."""
     m = a_map(mu=[0.1, 0.2], p=[1.5, 2.5], belt_speed=[1.5, 2.5])
