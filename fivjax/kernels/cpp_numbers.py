@@ -81,6 +81,13 @@ BY_NUMBER = {
 # Of whole numbers, one by one and side by side, where what holds is -1: as in JAX by zero, which would end the process.
 WHOLE_QUOTIENT = "({1} == 0 ? -1 : {0} / {1})", "(({1} == 0) | ({0} / ({1} - ({1} == 0))))"
 WHOLE_REMAINDER = "({1} == 0 ? {0} : {0} % {1})", "((({1} == 0) & {0}) | ({0} % ({1} - ({1} == 0))))"
+# Real numbers that become whole ones of a type, between the least and the most, and what is no number zero, as in JAX: beyond
+# them C++ has nothing.
+WITHIN_WHOLE = {
+    kind: f"({{0}} != {{0}} ? REAL(0) : ({{0}} > REAL({most}) ? REAL({most}) : "
+    f"({{0}} < REAL({least}) ? REAL({least}) : {{0}})))"
+    for kind, least, most in (("int", -(2.0**31), 2.0**31 - 1), ("long long", -(2.0**63), 2.0**63 - 1024))
+}
 # What leaves each number as it is.
 SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
 COMPARISONS = ("lt", "le", "lt_to", "le_to", "gt", "ge", "eq", "ne", "is_finite")

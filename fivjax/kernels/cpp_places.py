@@ -234,6 +234,8 @@ def _reshape(writer: Writer, equation, operands, kind: str) -> Value:
 
 def _best_place(sign: str) -> Callable:
     def of(writer: Writer, equation, operands, kind: str) -> Value:
+        # What is no number is the best, as in JAX.
+        is_better = f"(({{1}} == {{1}}) & !({{0}} {'<=' if sign == '>' else '>='} {{1}}))"
         (axis,) = equation.params["axes"]
         parts = np.moveaxis(writer.entries(operands[0]), axis, 0)
         found = np.empty(parts.shape[1:], object)
@@ -245,7 +247,7 @@ def _best_place(sign: str) -> Callable:
             best, at = parts[(0, *place)], 0
             for i in range(1, len(parts)):
                 own = parts[(i, *place)]
-                better = writer.one("gt" if sign == ">" else "lt", f"{{}} {sign} {{}}", [own, best], truth)
+                better = writer.one("gt" if sign == ">" else "lt", is_better, [own, best], truth)
                 at = writer.one("select_n", CHOICE, [better, at, i], number)
                 best = writer.one("select_n", CHOICE, [better, best, own], real)
             found[place] = at
@@ -255,7 +257,7 @@ def _best_place(sign: str) -> Callable:
 
 
 def _sort(writer: Writer, equation, operands) -> list[Value]:
-    """By insertion, which is stable; what belongs to the keys is moved with them."""
+    """By insertion, which is stable; what belongs to the keys is moved with them, and what is no number comes last."""
     if operands[0].ndim != 1 or equation.params["num_keys"] != 1:
         raise NotImplementedError("Only rows of numbers are sorted in C++ here, by one key.")
     of_lanes = writer.lanes and any(map(writer.is_wide, operands))
@@ -276,7 +278,9 @@ def _sort(writer: Writer, equation, operands) -> list[Value]:
         writer.put(f"const {row.kind} {name} = {row.base}[{own}];")
     moves = " ".join(f"{row.base}[{at} + 1] = {row.base}[{at}];" for row in rows)
     writer.put(f"int {at} = {own} - 1;")
-    writer.put(f"for (; {at} >= 0 && {rows[0].base}[{at}] > {kept[0]}; --{at}) {{ {moves} }}")
+    other = f"{rows[0].base}[{at}]"
+    is_later = f"({other} > {kept[0]} || ({other} != {other} && {kept[0]} == {kept[0]}))"
+    writer.put(f"for (; {at} >= 0 && {is_later}; --{at}) {{ {moves} }}")
     for row, name in zip(rows, kept, strict=True):
         writer.put(f"{row.base}[{at} + 1] = {name};")
     writer.close()
@@ -288,7 +292,8 @@ def _sort_lanes(writer: Writer, rows: list[View], own: str, at: str) -> None:
     writer.open(f"for (int {own} = {rows[0].size} - 1; {own} > 0; --{own})")
     writer.open(f"for (int {at} = 0; {at} < {own}; ++{at})")
     later = writer.name(TRUTHS)
-    writer.put(f"const {TRUTHS} {later} = {rows[0].base}[{at}] > {rows[0].base}[{at} + 1];")
+    one, other = (f"{rows[0].base}[{place}]" for place in (at, f"{at} + 1"))
+    writer.put(f"const {TRUTHS} {later} = ({one} > {other}) | (({one} != {one}) & ({other} == {other}));")
     for row in rows:
         first, second = f"{row.base}[{at}]", f"{row.base}[{at} + 1]"
         kept = writer.name(row.kind, "x")

@@ -19,7 +19,7 @@ from jax.extend.core import Jaxpr, Literal
 from ..foundation.jaxprs import within
 from . import cpp_lanes
 from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, has_known_numbers, natural, of_numbers
-from .cpp_lanes import KINDS, OF_LANES
+from .cpp_lanes import KINDS, OF_LANES, REALS
 from .cpp_numbers import (
     BY_NUMBER,
     COMPARISONS,
@@ -27,6 +27,7 @@ from .cpp_numbers import (
     WHOLE_QUOTIENT,
     WHOLE_REMAINDER,
     WIDE,
+    WITHIN_WHOLE,
     converted,
     keeping_nan,
     kind_of,
@@ -250,6 +251,9 @@ class Writer:
             return [MOVING_ENTRIES[name](*map(self.entries, operands), params)]
         if name in self.rules:
             return [self.rules[name](self, equation, operands, kinds[0])]
+        if name == "convert_element_type" and kinds[0] in WITHIN_WHOLE and kind_of(equation.invars[0].aval) == "double":
+            form = WITHIN_WHOLE[kinds[0]].replace("REAL", f"({REALS if self._any_wide_lanes(operands) else 'double'})")
+            operands = [self.each(name, form, operands, "double")]
         return [self.by_number(name, params, operands, kinds[0])]
 
     def by_number(self, name: str, params, operands: list[Value], kind: str) -> Value:

@@ -401,6 +401,31 @@ def at_the_edges(args, instants):
     }, ()
 
 
+def of_any_numbers(args, instants):
+    x, y = args
+    row = jnp.concatenate([x, y * jnp.ones(2)])
+    return {
+        "whole": [x.astype(jnp.int32), jnp.ceil(y).astype(jnp.int64), jnp.clip(x.astype(int), 0, 7)],
+        "best": [jnp.argmax(row), jnp.argmin(row), jnp.argmax(x), jnp.argmin(x)],
+        "sorted": [jnp.sort(row), jnp.argsort(row)],
+    }, ()
+
+
+def test_what_is_no_number_or_beyond_all_whole_ones_is_as_in_jax():
+    """C++ has nothing for the conversion of such numbers, and comparisons with them never hold."""
+    strange = np.array([1.0, -2.5, 3e9, -3e9, 1e300, -1e300, np.inf, -np.inf, np.nan])
+    rows = np.array([[a, b, c, d] for a in strange for b in strange for c, d in ((0.5, -7.0), (np.nan, 1.0))])
+    rows = np.concatenate([rows, rows[:, ::-1]])
+    kernel, form = KernelFunction(of_any_numbers), Form.of((rows[0, :3], rows[0, 3]))[0]
+    with jax.enable_x64(True):
+        expected = jax.vmap(lambda row: of_any_numbers((row[:3], row[3]), None)[0])(jnp.asarray(rows))
+    for side_by_side in (False, True):
+        found, _ = kernel.of_many(form, rows, side_by_side=side_by_side)
+        for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            # The largest whole number is no real one.
+            np.testing.assert_allclose(own, np.asarray(other, float), rtol=1e-15)
+
+
 @pytest.mark.filterwarnings("ignore:divide by zero")
 def test_places_outside_of_a_table_and_division_by_zero_are_as_in_jax():
     """Neither of them is anything for C++; a division would end the process."""
