@@ -72,6 +72,11 @@ class Branch:
         endings += [] if self.map is None else ["-map.nc"]
         *data, picture = output_paths(self.out, self.overwrite, *endings, ".png")
         scene = self.scene.scene()
+        if upwards is not None:
+            # Before the branches are computed, which takes minutes.
+            from ..maps.axes import checked_axes
+
+            checked_axes(scene, {upwards[0]: upwards[1]})
         branches = {}
         labels = [""] if other is None else [f"{other} = {value}" for value in apart(*values)]
         for value, label, path in zip(values, labels, data, strict=False):

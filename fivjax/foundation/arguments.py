@@ -181,7 +181,7 @@ def path(name: str, value) -> Path:
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """ " Did you mean `k1`?", for a name that is none of those known but close to one; else nothing."""
-    near = difflib.get_close_matches(name, known, n=1)
+    near = difflib.get_close_matches(str(name), known, n=1)
     return f" Did you mean `{near[0]}`?" if near else ""
 
 

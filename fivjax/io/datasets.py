@@ -116,6 +116,11 @@ def save(result, path: str | Path) -> Path:
             f"`fj.open(…)[['verdict', 'amplitude']].to_dataframe().to_csv(…)`."
         )
     _check_attributes(dataset)
+    stacked = [str(name) for name, index in dataset.indexes.items() if index.nlevels > 1]
+    if stacked:
+        raise ValueError(
+            f"Argument `result` is stacked along `{stacked[0]}`, which no file holds: save `result.unstack()`."
+        )
     # Made in memory first: on a full disk HDF5 crashes the whole process.
     return replace_whole(path, netcdf_of(dataset))
 

@@ -167,7 +167,7 @@ def _components(direction) -> dict[int, float]:
     elif arguments.is_whole(direction):
         if 0 <= direction <= 6:
             return {int(direction): 1.0}
-    elif np.shape(direction) == (3,) and np.linalg.norm(direction) > 0:
+    elif np.shape(direction) == (3,) and np.asarray(direction).dtype.kind in "iuf" and np.linalg.norm(direction) > 0:
         unit = np.asarray(direction, float) / np.linalg.norm(direction)
         return {axis + 1: float(share) for axis, share in enumerate(unit) if share != 0}
     raise ValueError(

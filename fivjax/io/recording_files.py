@@ -248,7 +248,7 @@ def _unit(path: Path, name: str, quantity: str, units: Mapping[str, str]) -> flo
     unit = units.get(name)
     if unit is None:
         return 1.0
-    if unit.strip() not in UNITS[quantity]:
+    if not isinstance(unit, str) or unit.strip() not in UNITS[quantity]:
         raise ValueError(
             f"File `{path}`, variable `{name}`: {unit!r} is no unit of {quantity}; known are {', '.join(UNITS[quantity])}."
         )

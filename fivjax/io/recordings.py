@@ -60,8 +60,8 @@ class Recording(eqx.Module):
     - `y0`: for a kick, the state at the simulation's start, as for `simulate`. Unless given it is steady sliding; on a belt at
       rest, where nothing slides steadily, it is unknown and fitted, and the recording begins with the simulation.
     - `offset`: for a kick, the time of the simulation (s) at which the recording's first sample lies, as one number if known,
-      else as the range to search: (0, 0.5) unless given, or 0 with `y0`. A recording that begins before the simulation has a
-      negative offset.
+      else as the range to search: (0, 0.5) unless given, or 0 with `y0`. A fit may leave the range, and then says so. A
+      recording that begins before the simulation has a negative offset.
     - `noise`: standard deviation of one sample, by channel or one number for all. Unless given, white noise is assumed and
       estimated from the differences between neighbouring samples or from the quiet part of the spectrum.
     - `sticking`, `detached`: for a limit cycle, the measured fraction of time in this status, as a pair: the value and its

@@ -77,7 +77,7 @@ def read_structure(
         >>> names = {"stiffness": "K", "mass": "M"}
         >>> big = fj.read_structure("model.npz", units="SI", names=names, labels=[(1, 1), (1, 3)], contacts=[contact])
     """
-    if units not in SYSTEMS:
+    if not isinstance(units, str) or units not in SYSTEMS:
         raise ValueError(
             f"Argument `units` must be one of {', '.join(map(repr, SYSTEMS))}, but is {units!r}. Files do not say which; "
             f"mass in t, forces in N and lengths in mm are 'mm-t-s'."
@@ -131,17 +131,16 @@ def read_structure(
 
 def _given(matrices: Mapping[str, Any], beside: dict[str, Any]) -> dict[str, FileMatrix]:
     """Stiffness, mass and damping (if there is one) in place of files."""
+    matrices = {role: matrix for role, matrix in matrices.items() if matrix is not None}
     if not {"stiffness", "mass"} <= set(matrices) <= set(NAMES):
         raise ValueError(
             f"Argument `path` must be a file, or hold the matrices 'stiffness' and 'mass', and perhaps 'damping', but holds "
-            f"{', '.join(map(repr, matrices))}."
+            f"{', '.join(map(repr, matrices)) or 'none'}."
         )
     for name, value in beside.items():
         if value is not None:
             raise ValueError(f"Argument `{name}` is about files. Leave it out: `path` holds the matrices themselves.")
-    found = {
-        role: matrix_of(f"Argument `path[{role!r}]`", matrix) for role, matrix in matrices.items() if matrix is not None
-    }
+    found = {role: matrix_of(f"Argument `path[{role!r}]`", matrix) for role, matrix in matrices.items()}
     held = usable("Argument `path`", found)
     for reason in held.left_out.values():
         raise ValueError(reason)

@@ -274,10 +274,10 @@ def _boundary(scene: Scene, exact: AbstractStepper, p, t1: float) -> Callable[[A
     if not np.isfinite(p_crit) and p is None:
         return lambda method: {}
     kicks = np.linspace(max(0.0, p_crit - 0.1), p_crit + 0.3, 24) if p is None else arguments.axis("p", p)
-    right = bistability_map(scene, p=kicks, method=exact, progress=False)["verdict"].values
+    right = _verdicts(scene, p=kicks, method=exact)["verdict"].values
 
     def measure(method: AbstractStepper) -> dict[str, float]:
-        verdicts = bistability_map(scene, p=kicks, method=method, progress=False)["verdict"].values
+        verdicts = _verdicts(scene, p=kicks, method=method)["verdict"].values
         wrong = (verdicts != right) & (verdicts >= 0) & (right >= 0)
         shares = {"wrong_verdicts": float(np.mean(wrong)), "undecided": float(np.mean(verdicts == Verdict.UNDECIDED))}
         if not np.isfinite(p_crit):
@@ -291,6 +291,14 @@ def _boundary(scene: Scene, exact: AbstractStepper, p, t1: float) -> Callable[[A
         return {**shares, "p_crit_error": abs(float(own["p_crit"][0]) - p_crit)}
 
     return measure
+
+
+def _verdicts(scene: Scene, **options):
+    """A whole map: what an interrupted one lacks would count as wrong."""
+    found = bistability_map(scene, **options, progress=False)
+    if np.any(found["verdict"] == Verdict.NOT_RUN):
+        raise KeyboardInterrupt
+    return found
 
 
 def _parts(scene: Scene, t1: float) -> dict[str, float]:
@@ -333,7 +341,7 @@ def refinement_trade(scene: Scene, halvings: int) -> dict[str, np.ndarray]:
             "p": np.linspace(*kicks, size),
         }
         begin = time.perf_counter()
-        found = bistability_map(scene, **axes, refine=count, audit=0.0, progress=False)
+        found = _verdicts(scene, **axes, refine=count, audit=0.0)
         seconds[count] = time.perf_counter() - begin
         computed[count] = float(np.mean(found["computed"])) if count else 1.0
         whole = found if whole is None else whole

@@ -177,7 +177,13 @@ def _design(structure: Structure, within: "_Bounds", tied, goal: _Goal, steps: i
     def values(shares):
         chosen = {key: low[i] + width[i] * shares[i] for i, key in enumerate(names)}
         everything = {**structure.parameters, **chosen}
-        return {**chosen, **{key: rule(everything) for key, rule in tied.items()}}
+        try:
+            return {**chosen, **{key: rule(everything) for key, rule in tied.items()}}
+        except KeyError as unknown:
+            raise ValueError(
+                f"A function in `tied` asks for {unknown}, which is no parameter of the structure; it has: "
+                f"{', '.join(structure.parameters)}."
+            ) from None
 
     def loss_and_quantity(shares):
         reached = quantity(structure.replace(**values(shares)))

@@ -56,7 +56,7 @@ def _matrices(scene, name, values):
         point = scene.replace(**{name: value})
         matrix, normal_forces = sliding_motion(point)
         # Without load the normal forces are zero, and there need be no equilibrium; there is a linear motion all the same.
-        exists = jnp.all(jnp.isfinite(matrix)) & ~jnp.any(normal_forces < 0)
+        exists = jnp.all(jnp.isfinite(matrix)) & ~jnp.any(normal_forces < 0) & jnp.all(point.belt_speed != 0)
         return matrix, exists
 
     return jax.lax.map(at, values, batch_size=POINTS_AT_ONCE)

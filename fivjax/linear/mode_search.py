@@ -123,6 +123,10 @@ def complex_modes(
     if isinstance(system, Pencil):
         if mu is not None:
             raise ValueError("Argument `mu` must not be given with a pencil: its matrices hold the friction.")
+        if direction != 1:
+            raise ValueError(
+                "Argument `direction` must not be given with a pencil: its matrices hold the belt's direction."
+            )
         pencil, motions = system, None
     else:
         if mu is None:
@@ -188,6 +192,8 @@ def _all(pencil: Pencil, band: float):
     state = np.block([[none, np.diag(frequencies)], [-stiffness / frequencies, -damping]]) / unit
     inertia = np.block([[np.eye(n), none], [none, mass]])
     (top, bottom), vectors = eig(state, inertia, homogeneous_eigvals=True)  # pyright: ignore[reportAssignmentType]
+    if np.any(np.abs(top) + np.abs(bottom) < 1e-14 * (np.abs(top) + np.abs(bottom)).max(initial=0.0)):
+        raise _singular()
     finite = np.abs(bottom) > 1e-14 * np.abs(top)
     values, shapes = unit * top[finite] / bottom[finite], (sizes / frequencies)[:, None] * vectors[:n, finite]
     # LAPACK's routine for real matrices gives exactly real eigenvalues, and exact pairs.
@@ -264,10 +270,7 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
     try:
         factors = splu(pencil.at(shift), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
     except RuntimeError:
-        raise ValueError(
-            f"The pencil is singular at {shift:.6g} 1/s, so its modes cannot be computed: some coordinate has neither mass nor "
-            f"stiffness. Hold it, or give it some."
-        ) from None
+        raise _singular() from None
     relative, mass, damping = shift / unit, unit**2 * pencil.mass, unit * pencil.damping
 
     def shift_inverse(state):
@@ -289,6 +292,13 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
         again = _round_off(pencil, again, anew[:n])
         values, states = np.append(values[~close], again), np.hstack([states[:, ~close], anew])
     return values, states[:n]
+
+
+def _singular() -> ValueError:
+    return ValueError(
+        "The pencil is singular, so its modes cannot be computed: some coordinate has neither mass nor stiffness. Hold it, or "
+        "give it some."
+    )
 
 
 def _near_the_real_axis(shift_inverse, shift: complex, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from ..model.structure import Structure
 
 def check_direction(direction) -> None:
     """Refuse any direction of the belt but +1 and -1."""
-    if direction not in (1, -1):
+    if np.ndim(direction) or direction not in (1, -1):
         raise ValueError(f"Argument `direction` must be 1 or -1, but is {direction!r}.")
 
 

@@ -15,13 +15,18 @@ from .results import by_name, not_run
 
 
 def linear_limit(scene: Scene, axes: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """The critical friction of linear theory, as an attribute: where friction is an axis and nothing else changes it."""
+    """The critical friction of linear theory, as an attribute: where constant friction is an axis and nothing else changes it;
+    none where there is no steady sliding.
+    """
     changes_it = set(scene.structure.parameters) & set(axes)
     # Only the sign of the belt speed matters.
     directions = np.unique(np.sign(axes.get("belt_speed", scene.belt_speed)))
-    if "mu" not in axes or changes_it or len(directions) != 1 or directions[0] == 0:
+    if not scene.friction.constant or "mu" not in axes or changes_it or len(directions) != 1 or directions[0] == 0:
         return {}
-    limit = float(critical_friction(scene.structure, direction=int(directions[0])))
+    try:
+        limit = float(critical_friction(scene.structure, direction=int(directions[0])))
+    except ValueError:
+        return {}
     return {"mu_crit": limit} if np.isfinite(limit) else {}
 
 
@@ -78,7 +83,15 @@ def check_size(axes: Mapping, halvings: int = 0, energy: bool = False, sparse: b
     if sparse:
         counts = {name: _count(values) for name, values in axes.items()}
     total, each = math.prod(counts.values()), sum(part.nbytes for part in by_name(not_run(1, energy)).values())
-    if total <= most_trajectories and total * each <= (machine_memory() or math.inf):
+    memory, longest = (
+        machine_memory() or math.inf,
+        max(((_count(values) - 1) * 2**halvings for values in axes.values()), default=0),
+    )
+    if sparse and 8 * longest > 0.1 * memory:
+        raise ValueError(
+            f"The axes ask for {longest:,} values along one of them, which take {8 * longest:,} bytes. Give a smaller `refine`."
+        )
+    if total <= most_trajectories and total * each <= memory:
         return
     listed = " × ".join(f"{count:,} of `{name}`" for name, count in counts.items())
     raise ValueError(

@@ -92,6 +92,8 @@ def run_to_verdict(
 def interrupted(verdicts: Verdicts) -> Verdicts:
     """What is known by now of trajectories, after a warning that says of how many nothing is."""
     total, left = len(verdicts.verdict), int(verdicts.pending().sum())
+    if not left:
+        return verdicts
     of = f"{total:,} {'trajectory' if total == 1 else 'trajectories'}"
     warnings.warn(
         f"Interrupted: of {of}, {left} without a verdict, labelled {Verdict.NOT_RUN.value}.",

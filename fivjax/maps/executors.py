@@ -14,6 +14,7 @@ A broken `concurrent.futures.ProcessPoolExecutor` is made anew with the same arg
 
 import contextlib
 import functools
+import pickle
 import queue
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -202,7 +203,7 @@ def hand_out(
     its worker dies three times again, the job is the cause, and `given_up` is called for it.
 
     **Raises:** `KeyboardInterrupt` once `stop()` is true, or if a worker was interrupted; `RuntimeError` if there are no
-    workers any more; and anything that a job raises.
+    workers any more; `ValueError` where jobs cannot be sent to them; and anything that a job raises.
     """
     waiting, suspects = deque(jobs), deque()
     # How often each job was lost while others ran, and while it ran alone.
@@ -237,6 +238,9 @@ def hand_out(
             except queue.Empty:
                 future = None
             if stop():
+                for finished, number in under_way.items():
+                    if _has_result(finished):
+                        done(number, finished.result())
                 raise KeyboardInterrupt
             if future is None or future not in under_way:
                 continue
@@ -245,6 +249,13 @@ def hand_out(
             try:
                 result = future.result()
             except BaseException as caught:
+                if isinstance(caught, pickle.PicklingError) or (
+                    isinstance(caught, AttributeError | TypeError) and "pickle" in str(caught)
+                ):
+                    raise ValueError(
+                        f"The scene cannot be sent to the workers of `executor` ({caught}). Define its classes and functions "
+                        f"in a module that they can import, or take an executor that sends them by value, such as loky's."
+                    ) from caught
                 if not is_loss(caught):
                     raise
                 error = caught

@@ -121,7 +121,13 @@ def finer_axis(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarr
     parts = 2**halvings if len(values) > 1 else 1
     share = np.arange(parts) / parts
     inside = values[:-1, None] + share * np.diff(values)[:, None]
-    return np.append(inside.ravel(), values[-1])
+    finer = np.append(inside.ravel(), values[-1])
+    if np.any(np.diff(finer) <= 0):
+        raise ValueError(
+            f"Argument `refine` asks for {parts} parts of each interval, but neighbouring values are closer than so many "
+            f"numbers. Give a smaller one."
+        )
+    return finer
 
 
 def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> tuple[Refined, Verdicts, Audit]:

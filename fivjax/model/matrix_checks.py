@@ -89,6 +89,10 @@ def check_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
     names = arguments.listed_names("coordinates", names, "x")
     if len(names) != n or len(set(names)) != n:
         raise ValueError(f"Argument `coordinates` must hold {n} different names, but is {list(names)!r}.")
+    if any("/" in name or not name for name in names):
+        raise ValueError(
+            f"Argument `coordinates` must hold names without `/`, as files need them, but is {list(names)!r}."
+        )
     velocity = next((name for name in names if f"d{name}" in names), None)
     if velocity is not None:
         raise ValueError(

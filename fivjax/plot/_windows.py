@@ -23,6 +23,15 @@ def shade(axes: Axes, run: Trajectory, part: slice) -> dict:
     return {handle.get_label(): handle for handle in shade_status(axes, shown)}
 
 
+def windows_of(windows) -> list[Window]:
+    """The windows of a list, or of an array; a single pair is one."""
+    single = np.shape(windows) == (2,)
+    listed = np.reshape(np.asarray([windows] if single else windows, float), (-1, 2)).tolist()
+    if not listed:
+        raise ValueError("Argument `windows` must be a list of windows, such as [(0.1, 0.2)], but is empty.")
+    return [(start, end) for start, end in listed]
+
+
 def inside(run: Trajectory, window: Window) -> slice:
     """The rows of a run in a window; refused if there are fewer than two."""
     check_run(run)

@@ -40,6 +40,10 @@ def branch(
         check_dataset(branches, ("amplitude",), call, "branches")
     for one in several.values():
         check_dataset(one, ("parameter", "amplitude", "special", "sliding_stable"), call, "branches")
+        if not one["amplitude"].ndim:
+            raise ValueError(
+                "A branch has an axis `point`, but of this one a single point was selected; select by slices."
+            )
     names = {str(one.attrs["parameter"]) for one in several.values()}
     if len(names) > 1:
         raise ValueError(

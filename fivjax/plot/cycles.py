@@ -23,7 +23,7 @@ STYLES = {
 }
 
 
-def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figure | None = None) -> Figure:
+def cycle(cycle: LimitCycle, others: LimitCycle | Sequence[LimitCycle] = (), *, figure: Figure | None = None) -> Figure:
     """A limit cycle in the phase plane, coloured by contact mode, and its Floquet multipliers beside the unit circle.
 
     For a torus, the points of the section are drawn instead of the multipliers. `others` (for instance the saddle cycle) are
@@ -31,6 +31,7 @@ def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figur
 
     **Raises:** `TypeError` for anything but a `LimitCycle`.
     """
+    others = (others,) if isinstance(others, LimitCycle) else others
     for one in (cycle, *others):
         arguments.instance("cycle", one, LimitCycle, "a limit cycle, such as `fivjax.limit_cycle(scene)`")
     figure = new_figure(figure, 9.6, 4.6)

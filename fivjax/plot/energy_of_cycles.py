@@ -12,7 +12,19 @@ from ..foundation import arguments
 from ..simulation.trajectory import Trajectory
 from ._windows import Window, align_zeros, inside, ledger, legend_between, legend_of_figure, shade, styles
 from .contact_status import STATUS_NAMES
-from .style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILION, check_dataset, check_run, legend_above, new_figure
+from .style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    check_dataset,
+    check_run,
+    check_runs,
+    legend_above,
+    new_figure,
+)
 
 PER_CYCLE = {"contact_work": "energy from the contact", "energy_gain": "energy gained"}
 
@@ -47,6 +59,7 @@ def detachments(
 
     **Raises:** `ValueError` for a run without a ledger, or a window that holds fewer than two of its instants.
     """
+    check_runs(runs, cycles, *([window] if isinstance(window, Mapping) else []))
     figure = new_figure(figure, 4.2 * len(runs), 5.4)
     grid = figure.add_gridspec(2, len(runs), height_ratios=(1, 1))
     below = figure.add_subplot(grid[1, :])

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..simulation.trajectory import Trajectory
-from ._windows import Window, align_zeros, inside, ledger, legend_between, legend_of_figure, shade, styles
+from ._windows import Window, align_zeros, inside, ledger, legend_between, legend_of_figure, shade, styles, windows_of
 from .style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILION, check_runs, legend_above, new_figure
 
 
@@ -15,7 +15,7 @@ def mechanical_power(run: Trajectory, windows: Sequence[Window], *, figure: Figu
 
     **Raises:** `ValueError` for a run without a ledger, or a window that holds fewer than two of its instants.
     """
-    power = ledger(run).power.mechanical
+    power, windows = ledger(run).power.mechanical, windows_of(windows)
     figure = new_figure(figure, 3.4 * len(windows), 3.4)
     panels = figure.subplots(1, len(windows), sharey=True, squeeze=False)[0]
     handles = {}
@@ -40,7 +40,7 @@ def mechanical_energy(
     runs = dict(runs) if isinstance(runs, Mapping) else {"": runs}
     check_runs(runs)
     longest = max(runs.values(), key=lambda run: run.t[-1])
-    windows = windows or [(float(longest.t[0]), float(longest.t[-1]))]
+    windows = windows_of(windows) if len(windows) else [(float(longest.t[0]), float(longest.t[-1]))]
     figure = new_figure(figure, 2.2 + 3.6 * len(windows), 3.4)
     panels = figure.subplots(1, len(windows), sharey=True, squeeze=False)[0]
     for axes, window in zip(panels, windows, strict=True):
@@ -61,6 +61,7 @@ def slip_reversal(
 
     **Raises:** `ValueError` for a window that holds fewer than two of a run's instants.
     """
+    check_runs(runs, windows)
     figure = new_figure(figure, 8.0, 2.4 + 2.2 * len(runs))
     whole, *panels = figure.subplots(1 + len(runs), 1)
     # The larger motion first, so that it does not hide the smaller.

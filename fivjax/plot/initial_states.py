@@ -1,5 +1,6 @@
 """Basins of attraction: which attractor each initial state leads to."""
 
+import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -36,24 +37,23 @@ def basins(dataset: xr.Dataset, *, saddle: LimitCycle | None = None, figure: Fig
     names = tuple(map(str, dataset["verdict"].dims))
     if len(names) != 2:
         raise ValueError(
-            f"A picture of basins needs two axes, but these have {len(names)}: {', '.join(names)}. Select with `.isel`."
+            f"A picture of basins needs two axes, but these have {len(names)}: {', '.join(names)}."
+            f"{' Select with `.isel`.' if len(names) > 2 else ''}"
         )
     figure = new_figure(figure, 7.2, 4.8)
     axes = figure.add_subplot()
     edges = [cell_edges(dataset[name].values) for name in names]
     verdict, attractor = dataset["verdict"].values.T, dataset["attractor"].values.T
     handles: list[Patch | Line2D] = []
-    share = 100 * float(dataset["sliding_share"])
-    handles += fill_cells(axes, edges, verdict == Verdict.SLIDING, SLIDING_SHADE, f"slides: {share:.1f} %")
+    # Of what is shown, which may be a part of what was computed.
+    slides = verdict == Verdict.SLIDING
+    handles += fill_cells(axes, edges, slides, SLIDING_SHADE, f"slides: {100 * np.mean(slides):.1f} %")
     # Colours of attractors, in the order of the table; readers who do not see red and green can distinguish them.
     colours = (BLUE, ORANGE, GREEN, PURPLE, SKY, "#F0E442")
     for place in range(dataset.sizes["attractors"]):
         one = dataset.isel(attractors=place)
-        label = (
-            f"{one['attractor_kind'].values!s}, {float(one['attractor_amplitude']):.4g} m/s: "
-            f"{100 * float(one['share']):.1f} %"
-        )
         there = (verdict == Verdict.LIMIT_CYCLE) & (attractor == place)
+        label = f"{one['attractor_kind'].values!s}, {float(one['attractor_amplitude']):.4g} m/s: {100 * np.mean(there):.1f} %"
         handles += fill_cells(axes, edges, there, colours[place % len(colours)], label)
     handles += fill_cells(
         axes, edges, verdict < 0, VERMILION, f"no verdict ({int((verdict < 0).sum())} of {verdict.size})"

@@ -31,9 +31,11 @@ def eigenvalues(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     **Raises:** `TypeError` for anything but modes.
     """
     check_dataset(dataset, ("frequency", "growth_rate"), "fj.cea.modes(structure, mu=np.linspace(0, 0.5, 501))")
+    if dataset["frequency"].ndim != 2 or "mode" not in dataset["frequency"].dims:
+        raise ValueError("This picture needs modes over a parameter, as `fj.cea.modes` returns them; select by slices.")
     figure = new_figure(figure, 6.4, 5.6)
     upper, lower = figure.subplots(2, 1, sharex=True)
-    name = str(dataset["frequency"].dims[0])
+    (name,) = (str(dim) for dim in dataset["frequency"].dims if dim != "mode")
     # A line through a single point cannot be seen.
     marker = "o" if dataset.sizes[name] == 1 else None
     for k, mode in enumerate(dataset["mode"].values):

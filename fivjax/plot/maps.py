@@ -27,6 +27,10 @@ def bistability(
     check_dataset(dataset, ("verdict", value), "fj.bistability_map(scene, mu=..., p=...)")
     names = tuple(map(str, dataset["verdict"].dims))
     _check_axes(dataset, names)
+    if set(dataset[value].dims) != set(names):
+        raise ValueError(
+            f"Argument `value` must be over {' and '.join(names)}, as the verdicts are, but `{value}` is not."
+        )
     if critical is not None:
         check_dataset(critical, ("p_crit",), "fj.critical_perturbation(scene, mu=...)", "critical")
     figure = new_figure(figure, 7.2, 4.8)

@@ -4,6 +4,8 @@ Figures are made without `pyplot`, so there is no global state. Colours are thos
 perceptually uniform colour maps; lines differ in style as well, so that everyone can distinguish them, even in grey.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -67,6 +69,8 @@ def coordinate_label(structure: Structure, index: int) -> str:
 def cell_edges(values: np.ndarray) -> np.ndarray:
     """The edges of cells around the values of an axis; a single value has a cell, too."""
     values = np.asarray(values, float)
+    if not len(values):
+        raise ValueError("A picture needs values along its axes, but one has none. Select less narrowly.")
     if len(values) == 1:
         half = 0.5 * abs(values[0]) or 0.5
         return np.array([values[0] - half, values[0] + half])
@@ -102,8 +106,8 @@ def check_run(run) -> None:
     run.refuse_batch("A picture")
 
 
-def check_runs(runs) -> None:
-    """Refuse anything but a mapping of trajectories by label."""
+def check_runs(runs, *beside) -> None:
+    """Refuse anything but a mapping of trajectories by label, and what lacks one of these labels `beside` it."""
     if not isinstance(runs, dict) or not runs:
         raise TypeError(
             'Argument `runs` must be trajectories by label, such as {"3 m/s": run}, but is '
@@ -111,6 +115,10 @@ def check_runs(runs) -> None:
         )
     for run in runs.values():
         check_run(run)
+    for other in beside:
+        missing = [label for label in runs if not isinstance(other, Mapping) or label not in other]
+        if missing:
+            raise ValueError(f"Cycles and windows must be given by the labels of `runs`, but {missing[0]!r} has none.")
 
 
 def check_dataset(dataset, variables: tuple[str, ...], call: str, name: str = "dataset") -> None:

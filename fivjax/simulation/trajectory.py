@@ -238,7 +238,7 @@ def simulate(
             f"{most_rows:.0e}. Save less often, or stop earlier."
         )
     # The quotient is rounded: by that alone there is no row more.
-    rows = math.ceil(asked * (1 - 1e-12) - 1e-9)
+    rows = max(math.ceil(asked * (1 - 1e-12) - 1e-9), 1)
     start, given = ("sliding equilibrium", None) if y0 is None else ("given by y0", start_state(scene, y0))
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)

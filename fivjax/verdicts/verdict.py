@@ -46,7 +46,8 @@ MEANING = {
     "lower the friction or the belt's inclination",
     Verdict.STEP_FAILURE: "its fastest vibration, or its contact events, need more steps than `max_steps` to reach a verdict; "
     "raise that, lower `t_max`, or soften what is stiffest",
-    Verdict.WORKER_LOST: "three workers in a row died while they ran it; give the workers more memory, or run it alone",
+    Verdict.WORKER_LOST: "three workers in a row died while they ran it; give the workers more memory, or run it alone, and "
+    "define laws of your own in a module that they can import",
     Verdict.NOT_RUN: "interrupted before a verdict; run it again",
 }
 

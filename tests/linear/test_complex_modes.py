@@ -233,6 +233,11 @@ def test_equal_eigenvalues_have_no_derivative_of_their_own():
     assert np.all(np.isnan(slopes["k"]))
 
 
+def test_a_coordinate_without_mass_and_stiffness_is_refused():
+    with pytest.raises(ValueError, match="some coordinate has neither mass nor stiffness"):
+        fj.cea.complex_modes(fj.cea.Pencil(np.diag([1.0, 0.0]), np.zeros((2, 2)), np.diag([1.0, 0.0])))
+
+
 def test_derivatives_at_zero():
     """Two masses of 1 kg on dampers of 2 N·s/m, joined by a spring: a spring dk to the ground moves the eigenvalue 0 to -dk/2."""
     joined = 1e4 * np.array([[1.0, -1.0], [-1.0, 1.0]])

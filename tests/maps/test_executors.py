@@ -1,6 +1,7 @@
 """Who runs a map's jobs: any executor gives the same map, and workers may die."""
 
 import multiprocessing
+import pickle
 import threading
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 
@@ -119,6 +120,35 @@ def test_a_pool_that_cannot_be_made_anew_says_how_it_could():
     workers = Workers(Deadly(lambda _: True, made))
     with pytest.raises(RuntimeError, match="Give a function that makes one"):
         hand_out([0, 1], lambda n: workers.submit(None, n), workers, print, print, lambda: False)
+
+
+def test_results_that_have_come_by_an_interrupt_are_kept():
+    """Of an executor whose number of workers is not known, many jobs are out at once."""
+    results, stopped = {}, []
+
+    class Quick:
+        def submit(self, function, number):
+            future = Future()
+            future.set_result(function(number))
+            stopped.append(number)
+            return future
+
+    workers = Workers(Quick())
+    with pytest.raises(KeyboardInterrupt):
+        hand_out(
+            range(9), lambda n: workers.submit(abs, n), workers, results.__setitem__, print, lambda: len(stopped) > 4
+        )
+    assert results == {number: number for number in range(9)}
+
+
+def test_a_scene_that_cannot_be_sent_to_workers_is_refused():
+    def submit(_):
+        future = Future()
+        future.set_exception(pickle.PicklingError("Can't pickle <lambda>"))
+        return future
+
+    with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match="Define its classes and functions in a module"):
+        hand_out([0], submit, Workers(pool), print, print, lambda: False)
 
 
 def test_what_a_job_raises_ends_the_run():

@@ -16,6 +16,7 @@ import xarray as xr
 import fivjax as fj
 from fivjax.kernels import kernel
 from fivjax.maps import engine, plan, trajectory_kernels
+from fivjax.maps.axes import linear_limit
 from fivjax.maps.groups import kick_of
 from fivjax.maps.trajectory_kernels import TrajectoryKernels
 from tests.helpers import oracle, reference
@@ -274,6 +275,21 @@ def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
     with pytest.warns(UserWarning, match="Interrupted"):
         m = fj.bistability_map(paper_scene, mu=[0.227], p=[1.01, 1.015, 1.02, 1.19], progress=False).isel(mu=0)
     assert m["verdict"].values.tolist() == [0, 0, 0, fj.Verdict.NOT_RUN]
+
+
+def test_a_map_notes_the_critical_friction_of_constant_friction_alone(paper_scene):
+    class Dropping(fj.AbstractFriction):
+        mu: jax.Array
+        drop: jax.Array
+
+        def __call__(self, slip_speed):
+            return self.mu - self.drop * (1 - jnp.exp(-slip_speed))
+
+    axes = {"mu": np.array([0.1, 0.2])}
+    assert linear_limit(paper_scene, axes)["mu_crit"] == pytest.approx(0.2282253477)
+    assert linear_limit(paper_scene.replace(friction=Dropping(jnp.array(0.2), jnp.array(0.1))), axes) == {}
+    loose = fj.Structure(np.eye(2), np.eye(2), np.diag([0.0, 1e4]), [0.0, -1.0], 0, 1)
+    assert linear_limit(fj.Scene(loose, fj.Coulomb(0.2), 1.0), axes) == {}
 
 
 def test_a_map_interrupted_while_only_the_linear_limit_is_awaited_has_all_its_verdicts(paper_scene, monkeypatch):

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 import fivjax as fj
 from fivjax import plot
 from fivjax.maps.axes import linear_limit
+from fivjax.plot._windows import windows_of
 from fivjax.plot.contact_status import KICK_HEIGHT
 from fivjax.plot.cycles import _section as draw_section
 from fivjax.plot.style import coordinate_label
@@ -290,6 +291,49 @@ def test_a_map_over_one_axis_is_a_curve_of_what_is_reached():
 
 
 # --- refusals
+
+
+def test_shares_of_a_part_of_basins_are_those_of_the_part():
+    """Of the whole, a quarter slides; of the part with the smaller friction, half."""
+    verdict, attractor = np.zeros((2, 2, 2), np.int8), np.full((2, 2, 2), -1)
+    verdict[1], verdict[0, 0] = 1, 1
+    attractor[verdict == 1] = 0
+    dims = ("mu", "x2", "dx2")
+    whole = xr.Dataset(
+        {
+            "verdict": (dims, verdict),
+            "attractor": (dims, attractor),
+            "share": ("attractors", [0.75]),
+            "sliding_share": 0.25,
+            "attractor_kind": ("attractors", ["cycle"]),
+            "attractor_amplitude": ("attractors", [1.5]),
+        },
+        {"mu": [0.1, 0.2], "x2": [0.0, 1.0], "dx2": [0.0, 1.0]},
+    )
+    legend = plot.basins(whole.isel(mu=0)).axes[0].get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["slides: 50.0 %", "cycle, 1.5 m/s: 50.0 %"]
+
+
+@pytest.mark.parametrize(
+    ("draw", "sentence"),
+    [
+        (lambda runs: plot.bistability(a_map(), value="p_crit"), "must be over mu and p, as the verdicts are"),
+        (lambda runs: plot.bistability(a_map().isel(mu=slice(0, 0))), "needs values along its axes"),
+        (lambda runs: plot.energy.slip_reversal(runs, {"other": (0.1, 0.2)}), "by the labels of `runs`"),
+        (lambda runs: plot.energy.slip_reversal(next(iter(runs.values())), (0.1, 0.2)), "trajectories by label"),
+    ],
+)
+def test_what_a_picture_cannot_be_made_of_is_told(draw, sentence, runs):
+    with pytest.raises((ValueError, TypeError), match=sentence):
+        draw(runs)
+
+
+def test_one_window_needs_no_list():
+    pair, two = (0.1, 0.2), [(0.1, 0.2), (0.3, 0.4)]
+    assert windows_of(pair) == windows_of([pair]) == windows_of(np.array(pair)) == [pair]
+    assert windows_of(np.array(two)) == windows_of(two) == two
+    with pytest.raises(ValueError, match="must be a list of windows"):
+        windows_of([])
 
 
 def test_a_stacked_map_is_drawn_unstacked():

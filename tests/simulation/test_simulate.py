@@ -326,6 +326,11 @@ def test_an_undeformed_structure_on_a_belt_at_rest_slips_the_way_it_is_pushed(mu
     assert np.abs(expected[0, -1]) > 1e-4 and np.all(run.status[1:] == Status.SLIDE)
 
 
+def test_a_run_shorter_than_its_rows_are_apart_has_its_start_and_its_end(paper_scene):
+    for t1 in (1e-9, 1e-3):
+        assert fj.simulate(paper_scene, t1, 1.0).t.tolist() == [0.0, t1]
+
+
 def test_what_no_load_presses_stays_where_it_is():
     resting = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.3), 0.0, fj.Pulse(100.0, 0.0, duration=0.01))
     run = fj.simulate(resting, 0.02, 1e-3, y0=np.zeros(6))
