@@ -192,8 +192,8 @@ def names_of_parameters(name: str, names: Collection[str], known: Iterable[str])
     if unknown is not None or not names:
         near = "" if unknown is None else did_you_mean(str(unknown), known)
         raise ValueError(
-            f"Argument `{name}` must name parameters of the scene, but has {'none' if unknown is None else unknown!r}; they "
-            f"are: {', '.join(known)}.{near}"
+            f"Argument `{name}` must name parameters of the scene, but {'is empty' if unknown is None else f'has {unknown!r}'}; "
+            f"they are: {', '.join(known)}.{near}"
         )
 
 

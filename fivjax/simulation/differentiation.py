@@ -94,6 +94,7 @@ def derivatives(
     dt_save: float = 1e-4,
     *,
     y0=None,
+    energy: bool = False,
     mode: str = "forward",
     method: AbstractStepper | None = None,
     margin: float = 1e-6,
@@ -114,6 +115,7 @@ def derivatives(
       `restitution` = 0 that towards larger values. By `duration` = 0 none is worked out: give a short one, such as 1e-9 s.
     - `scene`, `t1`, `dt_save`, `y0`, `method`, `progress`: as in `simulate`. With `WhereSwitched` the derivatives are those of
       its steps, which are wrong after contact events.
+    - `energy`: whether the trajectory has its ledger, `run.energy`, for a functional of energies.
     - `mode`: "forward" (faster up to some ten parameters) or "reverse" (keeps only the saved states in memory).
     - `margin`: the relative distance from another sequence of events below which derivatives are said not to exist.
 
@@ -137,6 +139,7 @@ def derivatives(
     arguments.names_of_parameters("wrt", names, scene.parameters)
     arguments.one_of("mode", mode, ("forward", "reverse"))
     arguments.real_number("margin", margin, minimum=0)
+    arguments.truth("energy", energy)
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
     method = EventExact() if method is None else method
@@ -148,7 +151,9 @@ def derivatives(
     begin = start_state(inner, None if y0 is None else start_in_contact_coordinates(scene, y0))
     if y0 is not None:
         given = begin if inner is scene else checked_start(scene.structure.size, y0)
-    value, by_name, moved = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
+    value, by_name, moved = _differentiated(
+        functional, scene, names, float(t1), float(dt_save), given, bool(energy), mode, method
+    )
     # A parameter may have several numbers: one for each contact.
     moved = {
         what: np.concatenate([np.reshape(found[name], (-1, np.size(scene.parameters[name]))).T for name in names])
@@ -174,9 +179,9 @@ def derivatives(
 
 
 @compiled
-def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
+def _differentiated(functional, scene, names, t1, dt_save, y0, energy, mode, method):
     def of(values):
-        run = simulate(scene.replace(**values), t1, dt_save, method, y0=y0, derivatives=mode)
+        run = simulate(scene.replace(**values), t1, dt_save, method, y0=y0, energy=energy, derivatives=mode)
         try:
             value = functional(run)
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
@@ -184,6 +189,10 @@ def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
                 "Argument `functional` must be a JAX function, but asks for a value while it is traced. Use `jax.numpy` in "
                 "place of NumPy, and no `float` or `if`."
             ) from error
+        except AttributeError as error:
+            if energy or "NoneType" not in str(error):
+                raise
+            raise TypeError("Argument `functional` asks for energies: give `energy=True`.") from error
         leaves = jax.tree.leaves(value)
         if not leaves or not all(jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in leaves):
             raise TypeError(

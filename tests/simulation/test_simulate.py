@@ -2,6 +2,7 @@
 
 import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -179,6 +180,30 @@ def test_derivatives_through_events_agree_forward_reverse_and_with_differences(p
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
     # Differences lose half of the digits to rounding at this step.
     np.testing.assert_allclose(forward, richardson, rtol=1e-6)
+
+
+def _energies(run) -> jax.Array:
+    energy = run.energy
+    return jnp.stack([energy.mechanical[-1], energy.work.damping[-1], energy.impact[-1], energy.work.contact[-1]])
+
+
+@pytest.mark.slow
+def test_energies_have_the_derivatives_of_differences(paper_scene):
+    """Through twelve events, of which some are impacts."""
+    scene = paper_scene.replace(mu=0.22, p=3.0, duration=0.02)
+    found = fj.derivatives(_energies, scene, ["mu", "k1"], 0.12, 0.12, energy=True)
+    assert found.exist and found.events == 12
+    for name, value in (("mu", 0.22), ("k1", 1e5)):
+        ends = [
+            np.array(_energies(fj.simulate(scene.replace(**{name: value * (1 + side)}), 0.12, 0.12, energy=True)))
+            for side in (-1e-6, 1e-6)
+        ]
+        np.testing.assert_allclose(found[name], (ends[1] - ends[0]) / (2e-6 * value), rtol=1e-6)
+
+
+def test_a_functional_of_energies_is_told_how_to_get_them(paper_scene):
+    with pytest.raises(TypeError, match="give `energy=True`"):
+        fj.derivatives(_energies, paper_scene, ["mu"], 0.1, 0.1)
 
 
 def test_the_dataset_of_a_run_says_what_it_is(paper_scene):
