@@ -190,10 +190,10 @@ def names_of_parameters(name: str, names: Collection[str], known: Iterable[str])
     known = sorted(known)
     unknown = next((one for one in names if one not in known), None)
     if unknown is not None or not names:
-        near = "" if unknown is None else did_you_mean(str(unknown), known)
+        said = "is empty" if unknown is None else f"has {unknown!r}"
+        near = "" if unknown is None else did_you_mean(unknown, known)
         raise ValueError(
-            f"Argument `{name}` must name parameters of the scene, but {'is empty' if unknown is None else f'has {unknown!r}'}; "
-            f"they are: {', '.join(known)}.{near}"
+            f"Argument `{name}` must name parameters of the scene, but {said}; they are: {', '.join(known)}.{near}"
         )
 
 
