@@ -90,24 +90,28 @@ def driven(kind, u) -> tuple[np.ndarray, np.ndarray]:
     """
     linear = kind.sliding.linear
     matrix, places = np.asarray(linear.matrix), kind.places if hasattr(kind, "places") else None
-    step, m = 2e-5, len(matrix)
-    advance = expm(step * matrix)
+    step, together = 2e-5, 1000
+    powers = [np.eye(len(matrix))]
+    for _ in range(together):
+        powers.append(expm(step * matrix) @ powers[-1])
+    powers = np.array(powers)
     pressing_margin, slip_margin = float(linear.pressing_margin), float(linear.slip_margin)
     if places is not None:
-        pushes, z = [], np.array(u)
+        pushes, shift, direct, z = [], 0.0, 0.0, np.array(u)
     else:
         n = SCENE.structure.size
         shift = np.asarray(linear.equilibrium)[sliding_states(n, SCENE.structure.normal)]
-        pushes, z = np.repeat(u, round(kind.time / kind.pieces / step)), np.zeros(m)
-    direct = 0.0 if places is not None else pressing_margin - float(np.asarray(linear.pressing) @ shift)
-    slips, presses = [], []
-    for k in range(200_000):
-        push = pushes[k] if k < len(pushes) else 0.0
-        slips.append(np.asarray(linear.slip) @ z)
-        presses.append(np.asarray(linear.pressing) @ z + push * direct)
-        rest = push * shift if push else 0.0
-        z = rest + advance @ (z - rest)
-    return -np.min(slips) / slip_margin, -np.min(presses) / pressing_margin
+        direct = pressing_margin - float(np.asarray(linear.pressing) @ shift)
+        pushes, z = [(push, round(kind.time / kind.pieces / step)) for push in u], np.zeros(len(matrix))
+    least_slip, least_press = np.inf, np.inf
+    for push, count in (*pushes, (0.0, 200_000 - sum(count for _, count in pushes))):
+        while count:
+            now = min(count, together)
+            states = push * shift + powers[: now + 1] @ (z - push * shift)
+            least_slip = min(least_slip, np.min(states[:-1] @ np.asarray(linear.slip)))
+            least_press = min(least_press, np.min(states[:-1] @ np.asarray(linear.pressing) + push * direct))
+            z, count = states[-1], count - now
+    return -least_slip / slip_margin, -least_press / pressing_margin
 
 
 @pytest.mark.parametrize("of", ["state", "history"])

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 import fivjax as fj
 from fivjax.steppers.kernel_scope import has_kernel
+from tests.helpers.catalogue import LOW_ORDER
 
 SPEEDS, VALUES = np.array([0.0, 1.5, 2.2, 10.0]), np.array([0.5, 0.45, 0.3, 0.28])
 
@@ -166,7 +167,7 @@ def test_what_is_beyond_a_table_is_what_jax_says(law):
     """On a belt beyond its end the block is drawn aside by 0.1; between its entries, by what lies between."""
     for belt_speed, friction in ((3.0, 0.1), (0.8, 0.22)):
         scene = block(law, belt_speed)
-        run = fj.simulate(scene, 0.5, 0.1)
+        run = fj.simulate(scene, 0.5, 0.1, LOW_ORDER)
         np.testing.assert_allclose(run.friction_force[0], friction, rtol=1e-12)
         assert run.meaning == "reached its end"
 
