@@ -123,26 +123,29 @@ def _following(
             tangential_velocity=y_struck[degrees_of_freedom(y) + mechanics.tangential],
         )
 
+    # Where no force is in a contact yet that stuck, the edge of the cone that has ended says where it is pushed.
+    held = contact.status == Status.STICK
+    edge = jnp.where(held & ended[..., 1], -1.0, 1.0).astype(y.dtype)
+
     # At the edge of the friction cone, or where N has just reached zero, rounding would decide whether the status that has
     # ended goes on. So it is excluded.
     if mechanics.several:
         y_next = jax.lax.cond(jnp.any(touched), struck, lambda: y_stopped)
         own = ended[..., 0] | ended[..., 1]
-        over = (own & (contact.status == Status.STICK)) | lifted
+        over = (own & held) | lifted
         # Where slip has ended, the contact sticks if it can: where the static coefficient is larger, it could slide as well.
         slides, slips = contact.status == Status.SLIDE, relative_velocity(mechanics, y) != 0
         arrested = slides & slips & (relative_velocity(mechanics, y_next) == 0)
         going_on = Contact(jnp.where(arrested, Status.STICK, contact.status), contact.direction)
         following = modes_from_forces(mechanics, load, y_next, going_on, jnp.where(over, state_of(contact), NONE))
+        idle = own & held & _is_free_of_force(mechanics, load, y_next)
+        following = Contact(following.status, jnp.where(idle, edge, following.direction))
         # What the event does not reach goes on: a contact whose mode ends at the same instant has an event of its own.
         reached = affected_by(mechanics, own)
         status = jnp.where(reached, following.status, contact.status).astype(contact.status.dtype)
         following = Contact(status, jnp.where(reached, following.direction, contact.direction))
     else:
         y_next = jnp.where(touched, struck(), y_stopped)
-        held = contact.status == Status.STICK
-        # Where no force is in the contact yet, the edge of the cone that has ended says where it is pushed.
-        edge = jnp.where(held & ended[1], -1.0, 1.0).astype(y.dtype)
         following = status_from_forces(mechanics, load, y_next, may_stick=~held, pushed=edge)
         status = jnp.where(lifted, Status.DETACH, following.status)
         rests = touched & (status != Status.DETACH)
@@ -194,6 +197,14 @@ def status_from_forces(
         jnp.where(sticks, Status.STICK, jnp.where(sliding_normal_force >= 0, Status.SLIDE, Status.DETACH)),
     )
     return Contact(status=status.astype(jnp.int32), direction=direction)
+
+
+def _is_free_of_force(mechanics: Mechanics, load: Float[Array, ""], y: State) -> Bool[Array, " c"]:
+    """Whether nothing accelerates a contact, in contact or not; only total forces can be exactly zero."""
+    if mechanics.rest is not None:
+        return jnp.zeros(len(mechanics.places), bool)
+    free = free_acceleration(mechanics, load, y)
+    return (free[mechanics.tangential] == 0) & (free[mechanics.normal] == 0)
 
 
 def _fall(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, "*contacts"]:

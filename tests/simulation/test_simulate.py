@@ -326,16 +326,19 @@ def test_an_undeformed_structure_at_rest_is_pressed_a_moment_later():
     np.testing.assert_allclose(run.velocity[-1], expected.v[-1], atol=1e-9 * np.abs(expected.v[-1]).max())
 
 
-@pytest.mark.parametrize("mu", [0.05, 0.5])
-@pytest.mark.parametrize("angle", [1.2, -1.2])
-def test_an_undeformed_structure_on_a_belt_at_rest_slips_the_way_it_is_pushed(mu, angle):
-    """The load reaches the contact by an inclined spring: no force is in it at first, then one outside of the cone."""
+@pytest.mark.parametrize("contacts", [1, 2])
+@pytest.mark.parametrize(("mu", "angle"), [(0.05, 1.2), (0.5, -1.2)])
+def test_an_undeformed_structure_on_a_belt_at_rest_slips_the_way_it_is_pushed(mu, angle, contacts):
+    """The load reaches each contact by an inclined spring: no force is in it at first, then one outside of the cone."""
     inclined = np.array([np.sin(angle), np.cos(angle), -np.cos(angle)])
     stiffness = np.diag([1e4, 2e3, 5e3]) + 5e4 * np.outer(inclined, inclined)
     mass, load = np.diag([1.0, 1.0, 0.5]), np.array([0.0, 0.0, -1.0])
     damping = 2.0 * mass + 2e-4 * stiffness
-    structure = fj.Structure(mass, damping, stiffness, load, 0, 1)
-    run = fj.simulate(fj.Scene(structure, fj.Coulomb(mu), 0.0, fj.ConstantLoad(100.0)), 8e-3, 1e-3, y0=np.zeros(6))
+    matrices = (np.kron(np.eye(contacts), matrix) for matrix in (mass, damping, stiffness))
+    points = [fj.ContactPoint(3 * k, 3 * k + 1) for k in range(contacts)]
+    structure = fj.Structure(*matrices, np.tile(load, contacts), contacts=points)
+    scene = fj.Scene(structure, fj.Coulomb(mu), 0.0, fj.ConstantLoad(100.0))
+    run = fj.simulate(scene, 8e-3, 1e-3, y0=np.zeros(6 * contacts))
     assert run.outcome == fj.Ending.FINISHED
 
     def sliding(_, state):
@@ -346,7 +349,8 @@ def test_an_undeformed_structure_on_a_belt_at_rest_slips_the_way_it_is_pushed(mu
         return [*rates, forces[0] + friction, forces[2] / 0.5]
 
     expected = solve_ivp(sliding, (0.0, 8e-3), np.zeros(4), t_eval=run.t, rtol=1e-11, atol=1e-16).y
-    np.testing.assert_allclose(run.displacement[:, [0, 2]], expected[:2].T, rtol=1e-8, atol=1e-14)
+    moved = run.displacement.reshape(-1, contacts, 3)[:, :, [0, 2]]
+    np.testing.assert_allclose(moved, np.repeat(expected[:2].T[:, None], contacts, axis=1), rtol=1e-8, atol=1e-14)
     assert np.abs(expected[0, -1]) > 1e-4 and np.all(run.status[1:] == Status.SLIDE)
 
 
