@@ -141,13 +141,10 @@ class Calibration(eqx.Module):
         for k, offset in enumerate(self.offsets):
             if offset is not None:
                 error = f"{offset[1]:.2g}" if np.isfinite(offset[1]) else "not known"
+                said.append(f"  offset of recording {k}: {offset[0]:.6g} ± {error} s")
                 low, high = self.recordings[k].offset
-                beside = (
-                    ""
-                    if low <= offset[0] <= high
-                    else f", outside of the range from {low:g} to {high:g} s that was searched"
-                )
-                said.append(f"  offset of recording {k}: {offset[0]:.6g} ± {error} s{beside}")
+                if not low <= offset[0] <= high:
+                    said[-1] += f", outside of the range from {low:g} to {high:g} s that was searched"
         return "\n".join(said)
 
     __repr__ = __str__

@@ -83,10 +83,8 @@ def check_size(axes: Mapping, halvings: int = 0, energy: bool = False, sparse: b
     if sparse:
         counts = {name: _count(values) for name, values in axes.items()}
     total, each = math.prod(counts.values()), sum(part.nbytes for part in by_name(not_run(1, energy)).values())
-    memory, longest = (
-        machine_memory() or math.inf,
-        max(((_count(values) - 1) * 2**halvings for values in axes.values()), default=0),
-    )
+    memory = machine_memory() or math.inf
+    longest = max((_count(values) for values in axes.values()), default=1) * 2**halvings
     if sparse and 8 * longest > 0.1 * memory:
         raise ValueError(
             f"The axes ask for {longest:,} values along one of them, which take {8 * longest:,} bytes. Give a smaller `refine`."
