@@ -236,7 +236,7 @@ def enter(
     landed = detached & (physics.gap(mechanics, after.y) == 0)
     loss = jnp.where(jnp.any(landed), loss, 0.0)
     dissipated = jnp.where(jnp.any(landed), loss + _sum(mechanics, by_belt), 0.0)
-    bounced = landed & (following == Status.DETACH) & (after.h > 0)
+    bounced = detached & after.ended[..., 0] & (following == Status.DETACH)
     by_contact = {}
     if mechanics.several:
         # Impulses act only at the contacts, so each contact has its own part of the loss.
