@@ -290,7 +290,7 @@ def test_a_run_that_did_not_reach_its_end_has_no_derivatives():
         (dict(functional=lambda run: None), TypeError, ["`functional`", "real numbers", "None"]),
         (dict(wrt="mu"), TypeError, ["`wrt`", "'mu'"]),
         (dict(wrt=["muu"]), ValueError, ["`wrt`", "'muu'", "belt_speed"]),
-        (dict(wrt=[]), ValueError, ["`wrt`", "none"]),
+        (dict(wrt=[]), ValueError, ["`wrt`", "is empty"]),
         (dict(mode="backward"), ValueError, ["`mode`", "forward", "reverse"]),
         (dict(margin=-1.0), ValueError, ["`margin`", "-1"]),
         (dict(t1=0.0), ValueError, ["`t1`", "positive"]),
