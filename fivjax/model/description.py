@@ -8,16 +8,19 @@ import html
 import json
 from collections.abc import Iterator, Mapping
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..foundation.numpy_evaluation import by_numpy
+from ..foundation.plain_trees import PACKAGE
 from ..foundation.precision import in_double_precision
 from ..foundation.quantities import quantity_of
 from ..foundation.traced_code import digest
 from .belt import belt_oscillator
 from .contact_point import ContactPoint
-from .friction import AbstractFriction, rebuilt
+from .friction import AbstractFriction, numeric_fields, rebuilt
 from .friction_per_contact import FrictionPerContact
 from .load import AbstractLoad
 from .own_structures import remembered
@@ -40,10 +43,56 @@ def describe(scene) -> dict:
         "of_friction": list(scene.parameters_of("friction law")),
         "of_load": list(scene.parameters_of("load")),
         **_own_code(structure),
+        **_own_parts(scene),
         **{name: np.asarray(getattr(structure, name)).tolist() for name in MATRICES},
         **_places(structure),
         "coordinates": list(structure.coordinates),
     }
+
+
+def _own_parts(scene) -> dict:
+    """Of laws and a load by classes of one's own, under `own_parts`: what else they hold, and what they compute by it."""
+    found = {}
+    for what, part in (
+        *zip(_names_of_laws(scene.friction), _each_law(scene.friction), strict=True),
+        ("load", scene.load),
+    ):
+        if type(part).__module__.partition(".")[0] != PACKAGE:
+            found[what] = {"fields": _plain_fields(part), "values": _values_of(part)}
+    return {"own_parts": found} if found else {}
+
+
+def _plain_fields(part) -> dict:
+    """The fields of a law or a load beside its parameters, as far as they are plain values."""
+    numeric, found = numeric_fields(part), {}
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name, None)
+        whole = eqx.is_array(value) and value.dtype.kind in "biu"
+        if field.name not in numeric and (whole or isinstance(value, bool | int | float | str)):
+            found[field.name] = np.asarray(value).tolist() if whole else value
+    return found
+
+
+def _values_of(part) -> list[float] | None:
+    """What a law gives at some slip speeds, or a load at some instants, by which its class is known again; None if unknown."""
+    try:
+        return np.asarray(_at_some(part)).tolist()
+    except Exception:  # of any kind, because the code is somebody else's
+        return None
+
+
+@by_numpy
+def _at_some(part):
+    jumps = [*part.jumps] if isinstance(part, AbstractLoad) else []
+    return jnp.stack([*jumps, *(jnp.asarray(part(jnp.asarray(at))) for at in (0.0123, 0.123, 1.23, 12.3))])
+
+
+def _each_law(friction) -> tuple:
+    return friction.laws if isinstance(friction, FrictionPerContact) else (friction,)
+
+
+def _names_of_laws(friction) -> list[str]:
+    return [f"friction law {i}" for i in range(len(_each_law(friction)))]
 
 
 def code_of(scene) -> dict[str, str]:
@@ -51,9 +100,8 @@ def code_of(scene) -> dict[str, str]:
     which do not tell what a class or a builder of one's own does.
     """
     one = jnp.ones(())
-    laws = scene.friction.laws if isinstance(scene.friction, FrictionPerContact) else (scene.friction,)
     return {
-        "friction law": " ".join(digest(_of_law, law, one) for law in laws),
+        "friction law": " ".join(digest(_of_law, law, one) for law in _each_law(scene.friction)),
         "load": digest(_of_load, scene.load, one),
         "structure": code_of_structure(scene.structure),
     }
@@ -127,10 +175,10 @@ def arguments_of_scene(description: Mapping) -> dict:
     A structure made by a function of one's own comes back with its parameters where this process has made one by the same
     function; else as its matrices: the same motion, without the names of its parameters.
 
-    **Raises:** `ValueError` for a friction law or a load whose class is not defined, or whose constructor does not take the
-    numbers that were saved; errors of other kinds for a damaged description.
+    **Raises:** `ValueError` for a friction law or a load whose class is not defined, or computes something else now, or whose
+    constructor does not take the values that were saved; errors of other kinds for a damaged description.
     """
-    parameters = description["parameters"]
+    parameters, own_parts = description["parameters"], description.get("own_parts", {})
 
     def of(part: str) -> dict:
         # Parts may have optional numbers by names that others have, too.
@@ -138,9 +186,9 @@ def arguments_of_scene(description: Mapping) -> dict:
 
     return {
         "structure": _structure(description),
-        "friction": _friction(description["friction"], of("of_friction")),
+        "friction": _friction(description["friction"], of("of_friction"), own_parts),
         "belt_speed": parameters["belt_speed"],
-        "load": _part(AbstractLoad, "load", description["load"], of("of_load")),
+        "load": _part(AbstractLoad, "load", description["load"], of("of_load"), own_parts.get("load")),
         "restitution": parameters["restitution"],
         "impact_law": description["impact_law"],
     }
@@ -190,30 +238,40 @@ def _is_described(structure: Structure, description: Mapping) -> bool:
     return True
 
 
-def _friction(name: str | list[str], parameters: Mapping):
+def _friction(name: str | list[str], parameters: Mapping, own_parts: Mapping):
     if isinstance(name, str):
-        return _part(AbstractFriction, "friction law", name, parameters)
+        return _part(AbstractFriction, "friction law", name, parameters, own_parts.get("friction law 0"))
 
     def own(i: int) -> dict:
         return {key.removesuffix(f"_{i}"): value for key, value in parameters.items() if key.endswith(f"_{i}")}
 
-    return [_part(AbstractFriction, "friction law", law, own(i)) for i, law in enumerate(name)]
+    each = [own_parts.get(f"friction law {i}") for i in range(len(name))]
+    return [_part(AbstractFriction, "friction law", law, own(i), each[i]) for i, law in enumerate(name)]
 
 
-def _part(kind: type, what: str, name: str, parameters: Mapping):
-    found = next((part for part in _descendants(kind) if part.__name__ == name), None)
+def _part(kind: type, what: str, name: str, parameters: Mapping, saved: Mapping | None):
+    """A law or a load by its class, the latest of that name; `saved` is what `_own_parts` said of it."""
+    found = next((part for part in reversed([*_descendants(kind)]) if part.__name__ == name), None)
     if found is None:
         raise ValueError(
             f"The scene's {what} is a `{name}`, which is not defined here. Import or define that class first, then ask again."
         )
-    own = {field.name: parameters[field.name] for field in dataclasses.fields(found) if field.name in parameters}
+    known = {**(saved["fields"] if saved else {}), **parameters}
+    own = {field.name: known[field.name] for field in dataclasses.fields(found) if field.name in known}
     try:
-        return found(**own)
+        made = found(**own)
     except TypeError as error:
         raise ValueError(
             f"The scene's {what}, a `{name}`, cannot be made again from its numbers ({error}). Its constructor must take its "
             f"fields by name; or build the scene by hand."
         ) from None
+    before, now = saved and saved["values"], saved and _values_of(made)
+    if before and now and not np.allclose(before, now, rtol=1e-9, atol=0.0, equal_nan=True):
+        raise ValueError(
+            f"The scene's {what} is a `{name}`, but the class of that name computes something else now. Define the class as it "
+            f"was, or build the scene by hand."
+        )
+    return made
 
 
 def _descendants(kind: type) -> Iterator[type]:

@@ -345,3 +345,26 @@ def test_a_load_that_breaks_its_contract_is_refused(load, fragments):
     with refused(ValueError, "`Load`", *fragments):
         fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, load)
     assert fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, Load()).load.force.dtype == np.float64
+
+
+def _law_with(power: int):
+    """A class `Fading` of its own each time, as when a notebook's cell is run again."""
+
+    class Fading(fj.AbstractFriction):
+        mu: jax.Array
+        exponent: int = eqx.field(static=True, default=1)
+
+        def __call__(self, slip_speed):
+            return self.mu / (1 + slip_speed) ** (power * self.exponent)
+
+    return Fading
+
+
+def test_a_law_comes_back_with_its_fixed_fields_and_as_the_class_is_now(paper_scene):
+    laws = [_law_with(power) for power in (1, 2)]
+    later = fj.Scene(paper_scene.structure, laws[1](jnp.float32(0.2), exponent=3), 1.0)
+    back = fj.Scene.from_dataset(fj.simulate(later, 0.01, 0.01).to_dataset())
+    assert type(back.friction) is laws[1] and back.friction.exponent == 3
+    earlier = fj.Scene(paper_scene.structure, laws[0](jnp.float32(0.2), exponent=3), 1.0)
+    with pytest.raises(ValueError, match="is a `Fading`, but the class of that name computes something else now"):
+        fj.Scene.from_dataset(fj.simulate(earlier, 0.01, 0.01).to_dataset())
