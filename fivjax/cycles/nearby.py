@@ -38,7 +38,8 @@ class NearbyCycle(eqx.Module):
 
     **Fields:** `period` in s; `amplitude`, the peak tangential speed, in m/s; `state`, displacements (m) and velocities (m/s)
     on the section; `residual`, how far the return is from the start, relative to the cycle's size; `found`, whether it closes
-    (to 1e-10) with the contact mode of the known one on the section: if not, all else is NaN; `multipliers` of the section's
+    (to 1e-10), not before as many crossings of the section, with the contact mode that the known one has there: if not, all
+    else is NaN, and `fj.limit_cycle(scene, start=cycle)` may find it; `multipliers` of the section's
     return map, largest first, without the one that is 1 for a deviation along the cycle; None unless asked for.
 
     **Example:**
@@ -134,6 +135,8 @@ def next_to(scene: Scene, before: Scene, point: Point, crossings, stages: int, m
     """The cycle of `scene` next to a point of a cycle of the scene `before`; with no stage, the cycle of that point."""
     root = _root(scene, before, point, crossings, stages=stages, twice=multipliers)
     found = root.missed <= CLOSED
+    if stages:
+        found &= ~_closes_earlier(scene, root.y, point.contact, crossings)
 
     def where_found(value):
         return jnp.where(found, value, jnp.nan)
@@ -225,6 +228,22 @@ def _image(scene: Scene, contact: Contact, crossings):
         return _Image(at.point.y, at.time, jnp.where(arrived, peak, jnp.nan)), (at.point.contact, arrived)
 
     return image
+
+
+def _closes_earlier(scene: Scene, y, contact: Contact, crossings) -> Bool[Array, ""]:
+    """Whether a motion has come back at an earlier crossing already: several contacts may cross the section less often in a
+    period than they did, and then this is more than one.
+    """
+    # As many crossings as are looked at, and how near to its start a motion is back.
+    most, near = 64, 1e-7
+    scene, y = jax.lax.stop_gradient((scene, y))
+    numbers = jnp.arange(1.0, most)
+    _, path = motion_to_section(
+        (scene, Point(y, contact), crossings, math.inf, np.True_), numbers, by_kernel=has_kernel(scene, EXACT_STEPPER)
+    )
+    weights = jnp.asarray(scene.structure.weights)
+    missed = jnp.linalg.norm(weights * (path.point.y - y), axis=-1) / jnp.linalg.norm(weights * y)
+    return jnp.any((numbers < crossings) & (missed <= near))
 
 
 def _closed(scene: Scene, guess, contact: Contact, crossings) -> _Root:

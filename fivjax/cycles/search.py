@@ -287,7 +287,8 @@ def _along_modes(scene: Scene, maps: ReturnMaps) -> Float[np.ndarray, "m 2n"]:
 
 def _state_of(scene: Scene, start, name: str = "start") -> np.ndarray:
     if isinstance(start, Trajectory):
-        return np.concatenate([np.asarray(start.displacement)[-1], np.asarray(start.velocity)[-1]])
+        start.refuse_batch("A start")
+        start = np.concatenate([np.asarray(start.displacement)[-1], np.asarray(start.velocity)[-1]])
     state = arguments.numeric_array(name, start).astype(float)
     if state.shape != (2 * scene.structure.size,):
         raise ValueError(
@@ -314,6 +315,7 @@ def _guess(maps: ReturnMaps, scene: Scene, start) -> tuple[Point, list[int]]:
     """A point of the section to begin at, and the numbers of crossings per period to try."""
     status, direction, only, own = None, None, np.zeros(1, int), 0
     if isinstance(start, LimitCycle):
+        _state_of(scene, start.deviation)
         own = start.crossings if start.kind == "periodic" else 0
         # The point of the other scene's cycle need not be on this scene's section, if an impact falls on the section.
         status, direction = start.contact.status, start.contact.direction

@@ -232,9 +232,15 @@ def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], piec
         raise ValueError(f"Argument `bounds` must name {what} where {over!r} is free, but has {unknown[0]!r}.")
     if over == "state":
         return smallest_of(InitialStates(scene))
-    time = bounds.get("duration", (0.0, float(scene.load.duration)))[1]
-    arguments.real_number("bounds['duration'][1]", time, above=0)
-    return smallest_of(Histories(scene, pieces, float(time)))
+    if not bounds:
+        arguments.real_number("scene.load.duration", scene.load.duration, above=0)
+        return smallest_of(Histories(scene, pieces, float(scene.load.duration)))
+    pair = arguments.numeric_array("bounds['duration']", bounds["duration"])
+    if pair.shape != (2,) or not 0 <= pair[0] < pair[1]:
+        raise ValueError(
+            f"Argument `bounds['duration']` must be two durations, the shorter one first, but is {bounds['duration']!r}."
+        )
+    return smallest_of(Histories(scene, pieces, float(pair[1])))
 
 
 def _descended(scene: Scene, p: float, duration: float, shortest: float, longest: float) -> tuple[float, float]:

@@ -57,7 +57,7 @@ def explorer(
     ranges = arguments.by_name("ranges", ranges, '"mu": (0.1, 0.4)')
     for name, pair in ranges.items():
         ends = arguments.numeric_array(f"ranges[{name!r}]", pair)
-        if ends.shape != (2,) or not ends[0] < ends[1]:
+        if ends.shape != (2,) or not ends[0] < ends[1] or not np.all(np.isfinite(ends)):
             raise ValueError(
                 f"Argument `ranges` must hold the two ends of each slider, the lower one first, but `{name}` has {pair!r}."
             )

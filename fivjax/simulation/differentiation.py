@@ -21,6 +21,7 @@ from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision, known_to_numpy
 from ..foundation.progress import reported
 from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
+from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .event_distance import ClosestCall, closest_call
@@ -33,7 +34,15 @@ LANDINGS_OF_SEVERAL = "a landing of several contacts with hardly any restitution
 HELD_BY_STATIC_FRICTION = (
     "a landing after which static friction alone holds the contact, and the least rebound makes it slide"
 )
-NOT_WORKED_OUT = (JUMPS_AT_ONCE, LANDINGS_OF_SEVERAL, HELD_BY_STATIC_FRICTION)
+ENERGY_OF_A_HELD_START = "the work of the impulse that holds a given start on the belt"
+ENERGY_OF_RESTITUTION = "the share of a landing and of what follows in the ledger, by a restitution of 0"
+NOT_WORKED_OUT = (
+    JUMPS_AT_ONCE,
+    LANDINGS_OF_SEVERAL,
+    HELD_BY_STATIC_FRICTION,
+    ENERGY_OF_A_HELD_START,
+    ENERGY_OF_RESTITUTION,
+)
 # By the restitution, how far rebounds are from vanishing.
 NO_REBOUND = "a landing without a rebound, at restitution 0,"
 # With less restitution, rebounds end in no time. What follows is worked out for one contact, and for impacts with friction.
@@ -161,15 +170,14 @@ def derivatives(
     }
     slips_move = np.any(moved["belt_speed"] != 0, axis=0) & (y0 is not None)
     calls = closest_call(inner, method, begin, float(t1), slips_move)
-    calls = _missing(scene, float(t1), moved, calls) or calls
+    n, (tangential, _) = inner.structure.size, contact_coordinates(inner.structure)
+    held = np.any(slips_move & (np.asarray(begin)[n + tangential] == np.asarray(inner.belt_speed)))
+    calls = _missing(scene, float(t1), moved, calls, bool(energy), bool(held)) or calls
     value = jax.tree.map(known_to_numpy, value)
     return Derivatives(
         value=value,
         # Rows that were not reached depend on nothing for JAX; their derivative is not zero but undefined.
-        by_name={
-            name: jax.tree.map(lambda slope, of: np.where(np.isfinite(of), known_to_numpy(slope), np.nan), found, value)
-            for name, found in by_name.items()
-        },
+        by_name={name: jax.tree.map(_where_finite, value, found) for name, found in by_name.items()},
         events=calls.events,
         closest=calls.closest,
         closest_at=calls.at,
@@ -210,13 +218,18 @@ def _differentiated(functional, scene, names, t1, dt_save, y0, energy, mode, met
     values = {name: scene.parameters[name] for name in names}
     found, value = jacobian(of, has_aux=True)(values)
     # For a functional of several numbers, the parameters are the last axis.
-    return value, {name: _of_parameter(found, name) for name in names}, jax.jacfwd(of_scene)(values)
+    by_name = {name: jax.tree.map(lambda _, slopes, name=name: slopes[name], value, found) for name in names}
+    return value, by_name, jax.jacfwd(of_scene)(values)
 
 
-def _missing(scene: Scene, t1: float, moved: dict[str, np.ndarray], calls: ClosestCall) -> ClosestCall | None:
+def _missing(
+    scene: Scene, t1: float, moved: dict[str, np.ndarray], calls: ClosestCall, energy: bool, held: bool
+) -> ClosestCall | None:
     """Something whose derivative is not worked out, or rebounds that nearly vanish; `moved`: the derivatives of parts of the
-    scene, a row each.
+    scene, a row each; `held` is whether a given start sticks to a belt whose speed moves.
     """
+    if energy and held:
+        return dataclasses.replace(calls, closest=0.0, at=0.0, event=ENERGY_OF_A_HELD_START)
     jumps, apart = np.asarray(scene.load.jumps), np.any(np.diff(moved["jumps"], axis=-1) != 0, axis=0)
     # The load between two jumps at one instant is not known.
     at_once = jumps[1:][(np.diff(jumps) == 0) & apart & (jumps[1:] >= 0) & (jumps[1:] < t1)]
@@ -224,6 +237,8 @@ def _missing(scene: Scene, t1: float, moved: dict[str, np.ndarray], calls: Close
         return dataclasses.replace(calls, closest=0.0, at=float(at_once[0]), event=JUMPS_AT_ONCE)
     restitution, landed = np.atleast_1d(scene.restitution), np.isfinite(calls.landed_at)
     moves = np.any(moved["restitution"] != 0, axis=0)
+    if energy and landed and np.any(moves & (restitution == 0)):
+        return dataclasses.replace(calls, closest=0.0, at=calls.landed_at, event=ENERGY_OF_RESTITUTION)
     several = len(scene.structure.places) > 1 and scene.impact_law != "coulomb"
     if several and landed and np.any(moves & (restitution < LITTLE)):
         return dataclasses.replace(calls, closest=0.0, at=calls.landed_at, event=LANDINGS_OF_SEVERAL)
@@ -239,5 +254,7 @@ def _finite(value) -> bool:
     return all(bool(np.all(np.isfinite(leaf))) for leaf in jax.tree.leaves(value))
 
 
-def _of_parameter(found, name: str):
-    return jax.tree.map(lambda leaf: leaf[name], found, is_leaf=lambda node: isinstance(node, dict))
+def _where_finite(value, slope):
+    """A derivative, whose last axis may be over a parameter's numbers; NaN where the value is no number."""
+    slope = known_to_numpy(slope)
+    return np.where(np.expand_dims(np.isfinite(value), tuple(range(np.ndim(value), np.ndim(slope)))), slope, np.nan)

@@ -53,7 +53,7 @@ from ..model.springs import Springs
 from ..model.structure import Structure
 from ..steppers.base import AbstractStepper, Within
 from ..steppers.core import Segment
-from ..steppers.section import rise_between
+from ..steppers.section import rise_between, well_before_section
 from .energy_lines import Energy as Energy
 from .energy_lines import Flows as Flows
 from .energy_lines import Ledger as Ledger
@@ -255,7 +255,9 @@ def enter(
         stick_time=ledger.stick_time + jnp.where(_all(mechanics, sticks), after.h, 0.0),
         detach_time=ledger.detach_time + jnp.where(_all(mechanics, detached), after.h, 0.0),
         events=ledger.events + _changes(mechanics, contact, after.contact, bounced),
-        crossings=ledger.crossings + rise_between(mechanics, y, after.end, after.y).happened,
+        # Not of what is at rest but for rounding.
+        crossings=ledger.crossings
+        + (rise_between(mechanics, y, after.end, after.y).happened & _moves_back(mechanics, y, after.end)),
         beyond_rest=ledger.beyond_rest + beyond_rest,
         start=ledger.start,
         worst=ledger.worst,
@@ -275,6 +277,10 @@ def _changes(mechanics: Mechanics, before: Contact, after: Contact, bounced) -> 
     reversed_ = (before.status == Status.SLIDE) & (before.direction != after.direction)
     happened = (before.status != after.status) | bounced | reversed_
     return jnp.sum(happened, dtype=jnp.int32) if mechanics.several else happened
+
+
+def _moves_back(mechanics: Mechanics, *states: State) -> Array:
+    return jnp.any(jnp.stack([well_before_section(mechanics, y) for y in states]))
 
 
 def entered(

@@ -22,7 +22,7 @@ from ..foundation.compiling import power_of_4
 from ..foundation.precision import in_double_precision, is_known
 from ..io.datasets import labelled
 from ..kernels.functions import KernelFunction
-from ..model.load import next_jump
+from ..model.load import load_from, next_jump
 from ..model.scene import Scene, refuse_vector_contacts
 from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment, follow
@@ -221,7 +221,7 @@ def _find(args, numbers: Float[Array, " most"]):
         found, before, _ = jax.lax.while_loop(going, lambda carry: stretch(carry[0]), nothing_yet)
         # A row at a jump of the load has counted the event that it demands at once.
         now = of_events & (count(found.ledger) < count(begin.ledger) + number) & jnp.any(found.t == scene.load.jumps)
-        after, ledger = after_jump(mechanics, found.contact, found.ledger, scene.load(found.t), found.y, now)
+        after, ledger = after_jump(mechanics, found.contact, found.ledger, load_from(scene.load, found.t), found.y, now)
         before = jnp.where(count(ledger) > count(found.ledger), found.contact.status, before)
         found = found._replace(contact=after, ledger=ledger)
         return found, (found, before)

@@ -107,7 +107,7 @@ def _followed(args, instants, method: EventExact):
         finite = jnp.all(jnp.isfinite(y))
         # Too few steps, or a step of no length: the series does not reach the row.
         short = now.end < instant
-        load = scene.load(instant)
+        load = load_from(scene.load, instant)
         highest = jnp.maximum(now.highest, jnp.abs(load))
         beyond = ~lost & finite & ~short & grown(scene, y0, instant, highest, y)
         failure = jnp.where(

@@ -78,6 +78,10 @@ def checked_start(n: int, y0) -> State:
     y = jnp.concatenate(parts)
     if is_known(y) and not np.all(np.isfinite(y)):
         raise ValueError("Argument `y0` must be finite.")
+    if is_known(y) and np.any(np.abs(y) > arguments.LARGEST):
+        raise ValueError(
+            f"Argument `y0` must be at most {arguments.LARGEST:g} in size, because products of it are computed."
+        )
     return y
 
 

@@ -47,9 +47,12 @@ def before_section(mechanics: Mechanics, y: State) -> Bool[Array, ""]:
     """Whether a state lies before the section, and not on it. A sum of velocities is zero on the section only up to
     rounding.
     """
+    return well_before_section(mechanics, y) if mechanics.several else section_speed(mechanics, y) < 0
+
+
+def well_before_section(mechanics: Mechanics, y: State) -> Bool[Array, ""]:
+    """The same by more than rounding of a state."""
     speed = section_speed(mechanics, y)
-    if not mechanics.several:
-        return speed < 0
     n = y.shape[0] // 2
     rate = jnp.sqrt(jnp.max(jnp.abs(mechanics.free_position)))
     size = jnp.max(jnp.abs(y[n:])) + rate * jnp.max(jnp.abs(y[:n]))

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.cycles.cycle import point_of
+from fivjax.cycles.nearby import next_to
 from fivjax.foundation.compiling import compiled
+from fivjax.foundation.precision import in_double_precision
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.ConstantLoad(100.0))
 
@@ -28,6 +31,15 @@ def test_forward_derivatives_are_those_of_the_cycle(cycle):
     above, here, below = (fj.limit_cycle(SCENE.replace(mu=mu), cycle).amplitude for mu in (0.21001, 0.21, 0.20999))
     assert value == pytest.approx(here, rel=1e-12)
     assert slope == pytest.approx((above - below) / 2e-5, rel=1e-6)
+
+
+@pytest.mark.parametrize(("crossings", "found"), [(1, True), (2, False)])
+def test_a_motion_that_is_back_at_an_earlier_crossing_is_not_the_cycle(cycle, crossings, found):
+    """Two contacts may cross the section less often than they did; then two turns close, too, with twice the period."""
+    count = np.asarray(crossings, np.int32)
+    next_one = in_double_precision(next_to)(cycle.scene, cycle.scene, point_of(cycle), count, 1, False)
+    assert bool(next_one.found) is found
+    assert float(next_one.residual) < 1e-10
 
 
 @pytest.mark.slow

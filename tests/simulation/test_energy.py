@@ -293,6 +293,42 @@ def test_signs(squeal):
     np.testing.assert_allclose(sum(energy.work.dampers.values()), energy.work.damping, rtol=1e-12)
 
 
+def test_what_is_at_rest_but_for_rounding_crosses_nothing():
+    """Until the kick only rounding moves; however long it is waited for, the cycles are the same."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2, duration=0.02))
+    ends = [
+        fj.energy_per_cycle(fj.simulate(scene.replace(start=start), start + 0.1, 1e-3, energy=True)).cycle_end - start
+        for start in (0.0, 0.5)
+    ]
+    assert len(ends[0]) == 5
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-10)
+
+
+class _Late(fj.AbstractLoad):
+    """100 N up to and including an instant, 150 N after it."""
+
+    force: jax.Array
+    at: jax.Array
+
+    @property
+    def jumps(self):
+        return self.at[None]
+
+    @property
+    def final(self):
+        return 1.5 * self.force
+
+    def __call__(self, t):
+        return jnp.where(t <= self.at, self.force, 1.5 * self.force)
+
+
+def test_a_row_at_a_jump_has_the_load_after_it_whatever_is_said_of_the_instant_itself():
+    load = _Late(jnp.float32(100.0), jnp.float32(0.125))
+    run = fj.simulate(fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, load), 0.25, 1 / 64)
+    assert run.load.tolist() == [100.0] * 8 + [150.0] * 9
+    assert np.abs(run.acceleration[8]).max() > 50
+
+
 @pytest.mark.parametrize("p", [0.0, 8.0])
 def test_an_event_at_a_jump_of_the_load_is_in_the_table_whether_or_not_a_row_is_there(p):
     """The load acts on the mass in contact: where the kick begins it lifts off, and where it ends it slips, at once."""

@@ -200,6 +200,36 @@ def test_energies_have_the_derivatives_of_differences(paper_scene):
         np.testing.assert_allclose(found[name], (ends[1] - ends[0]) / (2e-6 * value), rtol=1e-6)
 
 
+@pytest.mark.slow
+def test_energies_whose_derivatives_are_not_worked_out_are_not_relied_on(paper_scene):
+    """The work of what holds a start on the belt; and the share of landings, by a restitution of 0."""
+    held = np.array([1e-4, 0.0, 0.0, float(paper_scene.belt_speed), 0.0, 0.0])
+    found = fj.derivatives(_energies, paper_scene, ["belt_speed"], 0.01, 0.01, y0=held, energy=True)
+    assert not found.exist and "the work of the impulse that holds a given start" in found.reason
+    falling = np.array([0.0, 0.0, 1e-3, 0.0, 0.0, -0.1])
+    found = fj.derivatives(_energies, paper_scene, ["restitution"], 0.1, 0.1, y0=falling, energy=True)
+    assert not found.exist and "by a restitution of 0" in found.reason
+
+
+@pytest.mark.slow
+def test_functionals_may_be_trees_of_numbers_by_a_parameter_of_several(paper_scene):
+    own = paper_scene.structure
+    matrices = [np.kron(np.eye(2), np.asarray(matrix)) for matrix in own.matrices[:3]]
+    points = [fj.ContactPoint(own.tangential + 3 * k, own.normal + 3 * k) for k in (0, 1)]
+    pair = fj.Structure(*matrices, np.tile(own.load_direction, 2), contacts=points)
+    scene = fj.Scene(pair, fj.Coulomb(0.2), [1.0, 0.8], fj.Pulse(100.0, 1.3))
+
+    def functional(run):
+        return {
+            "mu": run.velocity[-1, :2],
+            "other": jnp.stack([run.displacement[-1, 0], jnp.nan * run.displacement[-1, 0]]),
+        }
+
+    found = fj.derivatives(functional, scene, ["belt_speed", "mu"], 0.01, 0.01)
+    assert found["belt_speed"]["mu"].shape == (2, 2) and found["mu"]["mu"].shape == (2,)
+    assert np.isnan(found["belt_speed"]["other"]).tolist() == [[False, False], [True, True]]
+
+
 def test_a_functional_of_energies_is_told_how_to_get_them(paper_scene):
     with pytest.raises(TypeError, match="give `energy=True`"):
         fj.derivatives(_energies, paper_scene, ["mu"], 0.1, 0.1)
