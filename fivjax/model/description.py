@@ -8,7 +8,6 @@ import html
 import json
 from collections.abc import Iterator, Mapping
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +66,7 @@ def _plain_fields(part) -> dict:
     numeric, found = numeric_fields(part), {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name, None)
-        whole = eqx.is_array(value) and value.dtype.kind in "biu"
+        whole = isinstance(value, jax.Array | np.ndarray) and value.dtype.kind in "biu"
         if field.name not in numeric and (whole or isinstance(value, bool | int | float | str)):
             found[field.name] = np.asarray(value).tolist() if whole else value
     return found
