@@ -46,13 +46,14 @@ def keeper_at(
     path = Path(path).absolute()
     # Packages whose versions may change a map's last bits.
     packages = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "equinox")
+    # Compared by the digests of `code_of`.
+    told_by_code = ("structure_code", "own_parts")
     run = {
         "fivjax": metadata.version("fivjax"),
         **{package: metadata.version(package) for package in packages},
         **kernels_by(method, scene),
         "device": jax.devices()[0].device_kind,
-        # What the structure's function computes is among the code below.
-        "scene": {name: value for name, value in describe(scene).items() if name != "structure_code"},
+        "scene": {name: value for name, value in describe(scene).items() if name not in told_by_code},
         "method": re.sub(r" at 0x[0-9a-f]+", "", repr(method)),
         "code": code_of(scene) | _code_of_method(method, scene),
         **limits,
