@@ -188,10 +188,7 @@ def smallest_kick(
             f"Argument `bounds` must name what of a kick is free ({', '.join(OF_KICK)}), but has {unknown[0]!r}."
         )
     for name, pair in given.items():
-        if arguments.numeric_array(f"bounds[{name!r}]", pair).shape != (2,):
-            raise ValueError(f"Argument `bounds[{name!r}]` must be two numbers, the lower one first, but is {pair!r}.")
-        arguments.real_number(f"bounds[{name!r}][0]", pair[0], minimum=1 if name == "p" else 0)
-        arguments.real_number(f"bounds[{name!r}][1]", pair[1], above=float(pair[0]))
+        _check_pair(name, pair)
     shortest, longest = given["duration"] if "duration" in free else (own, own)
     certified = 1.0 + certified_excess(scene, float(shortest), float(longest))
     starts = _nominated(scene, float(shortest), float(longest)) if "duration" in free else np.array([own])
@@ -235,12 +232,16 @@ def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], piec
     if not bounds:
         arguments.real_number("scene.load.duration", scene.load.duration, above=0)
         return smallest_of(Histories(scene, pieces, float(scene.load.duration)))
-    pair = arguments.numeric_array("bounds['duration']", bounds["duration"])
-    if pair.shape != (2,) or not 0 <= pair[0] < pair[1]:
-        raise ValueError(
-            f"Argument `bounds['duration']` must be two durations, the shorter one first, but is {bounds['duration']!r}."
-        )
-    return smallest_of(Histories(scene, pieces, float(pair[1])))
+    _check_pair("duration", bounds["duration"])
+    return smallest_of(Histories(scene, pieces, float(bounds["duration"][1])))
+
+
+def _check_pair(name: str, pair) -> None:
+    """Refuse bounds that are not two numbers, the lower one first."""
+    if arguments.numeric_array(f"bounds[{name!r}]", pair).shape != (2,):
+        raise ValueError(f"Argument `bounds[{name!r}]` must be two numbers, the lower one first, but is {pair!r}.")
+    arguments.real_number(f"bounds[{name!r}][0]", pair[0], minimum=1 if name == "p" else 0)
+    arguments.real_number(f"bounds[{name!r}][1]", pair[1], above=float(pair[0]))
 
 
 def _descended(scene: Scene, p: float, duration: float, shortest: float, longest: float) -> tuple[float, float]:

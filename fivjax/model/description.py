@@ -6,7 +6,7 @@ A dataset's attributes hold everything that defines its scene, so that `Scene.fr
 import dataclasses
 import html
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -50,15 +50,16 @@ def describe(scene) -> dict:
 
 
 def _own_parts(scene) -> dict:
-    """Of laws and a load by classes of one's own, under `own_parts`: what else they hold, and what they compute by it."""
-    found = {}
-    for what, part in (
-        *zip(_names_of_laws(scene.friction), _each_law(scene.friction), strict=True),
-        ("load", scene.load),
-    ):
-        if type(part).__module__.partition(".")[0] != PACKAGE:
-            found[what] = {"fields": _plain_fields(part), "values": _values_of(part)}
-    return {"own_parts": found} if found else {}
+    """Of laws and a load by classes of one's own, under `own_parts`; None stands for those of fivjax."""
+    laws, load = [_own_part(law) for law in _each_law(scene.friction)], _own_part(scene.load)
+    return {"own_parts": {"laws": laws, "load": load}} if load or any(laws) else {}
+
+
+def _own_part(part) -> dict | None:
+    """What a law or a load by a class of one's own holds beside its parameters, and what it computes by all of that."""
+    if type(part).__module__.partition(".")[0] == PACKAGE:
+        return None
+    return {"fields": _plain_fields(part), "values": _values_of(part)}
 
 
 def _plain_fields(part) -> dict:
@@ -88,10 +89,6 @@ def _at_some(part):
 
 def _each_law(friction) -> tuple:
     return friction.laws if isinstance(friction, FrictionPerContact) else (friction,)
-
-
-def _names_of_laws(friction) -> list[str]:
-    return [f"friction law {i}" for i in range(len(_each_law(friction)))]
 
 
 def code_of(scene) -> dict[str, str]:
@@ -185,7 +182,7 @@ def arguments_of_scene(description: Mapping) -> dict:
 
     return {
         "structure": _structure(description),
-        "friction": _friction(description["friction"], of("of_friction"), own_parts),
+        "friction": _friction(description["friction"], of("of_friction"), own_parts.get("laws")),
         "belt_speed": parameters["belt_speed"],
         "load": _part(AbstractLoad, "load", description["load"], of("of_load"), own_parts.get("load")),
         "restitution": parameters["restitution"],
@@ -237,19 +234,18 @@ def _is_described(structure: Structure, description: Mapping) -> bool:
     return True
 
 
-def _friction(name: str | list[str], parameters: Mapping, own_parts: Mapping):
+def _friction(name: str | list[str], parameters: Mapping, saved: Sequence | None):
     if isinstance(name, str):
-        return _part(AbstractFriction, "friction law", name, parameters, own_parts.get("friction law 0"))
+        return _part(AbstractFriction, "friction law", name, parameters, saved and saved[0])
 
     def own(i: int) -> dict:
         return {key.removesuffix(f"_{i}"): value for key, value in parameters.items() if key.endswith(f"_{i}")}
 
-    each = [own_parts.get(f"friction law {i}") for i in range(len(name))]
-    return [_part(AbstractFriction, "friction law", law, own(i), each[i]) for i, law in enumerate(name)]
+    return [_part(AbstractFriction, "friction law", law, own(i), saved and saved[i]) for i, law in enumerate(name)]
 
 
 def _part(kind: type, what: str, name: str, parameters: Mapping, saved: Mapping | None):
-    """A law or a load by its class, the latest of that name; `saved` is what `_own_parts` said of it."""
+    """A law or a load by its class, the latest of that name; `saved` is what `_own_part` said of it."""
     found = next((part for part in reversed([*_descendants(kind)]) if part.__name__ == name), None)
     if found is None:
         raise ValueError(

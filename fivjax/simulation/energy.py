@@ -46,7 +46,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, State, Status
+from ..contact import Contact, Mechanics, State, Status, same_mode
 from ..foundation.precision import returning_numpy
 from ..model.scene import Scene
 from ..model.springs import Springs
@@ -274,8 +274,7 @@ def at_transition(mechanics: Mechanics, ledger: Ledger, before: Contact, after: 
 
 def _changes(mechanics: Mechanics, before: Contact, after: Contact, bounced) -> Array:
     """How many contacts have an event between two modes."""
-    reversed_ = (before.status == Status.SLIDE) & (before.direction != after.direction)
-    happened = (before.status != after.status) | bounced | reversed_
+    happened = ~same_mode(before.status, before.direction, after.status, after.direction) | bounced
     return jnp.sum(happened, dtype=jnp.int32) if mechanics.several else happened
 
 

@@ -116,13 +116,14 @@ def _rows(scene: Scene, start: State, saved, states, energy_data, highest=0.0, e
     before.
     """
     mechanics, (y, contacts, ledgers) = Mechanics(scene), states
-    load = jax.vmap(lambda t: load_from(scene.load, t))(saved)
+    acting = jax.vmap(lambda t: load_from(scene.load, t))
+    load = acting(saved)
     # Rows after one that is not finite are not finite either, even where contact would set a value to zero.
     finite = jnp.logical_not(ended) & (jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0)
     highest = jnp.maximum(highest, jnp.max(jnp.abs(load)))
     # The load may have been higher between two rows.
     jumps = scene.load.jumps
-    between = jnp.where(jumps <= saved[-1], jnp.abs(jax.vmap(lambda t: load_from(scene.load, t))(jumps)), 0.0)
+    between = jnp.where(jumps <= saved[-1], jnp.abs(acting(jumps)), 0.0)
     highest = jnp.maximum(highest, jnp.max(between, initial=0.0))
     beyond = jax.vmap(lambda t, y: grown(scene, start, t, highest, y))(saved, y)
     unbounded = finite & (jnp.cumsum(beyond) > 0)
