@@ -12,7 +12,7 @@ import pytest
 import fivjax as fj
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
-FLAGS, KERNEL_FLAGS = "XLA_FLAGS", "FIVJAX_KERNEL_FLAGS"
+FLAGS = "XLA_FLAGS"
 
 # A shell that starts them in the background has them ignore Ctrl-C, and what they start; some of them send it.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -21,16 +21,11 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Tests run most programs once or twice, so they wait for the compiler and not for what it has compiled. Without LLVM's
 # optimisations, and without parts that are compiled side by side, it takes less than half of the time. At this level LLVM would
 # choose instructions by a quick way, too (`fast-isel`), which makes wrong programs (`COMPILED_QUICKLY` in `compiling`): by the
-# thorough one the results are right. For a run as users compile, set `XLA_FLAGS` and `FIVJAX_KERNEL_FLAGS`, which may be empty.
+# thorough one the results are right. For a run as users compile, set `XLA_FLAGS`, which may be empty.
 COMPILED_FOR_TESTS = "--xla_backend_optimization_level=0 --xla_backend_extra_options=-fast-isel=false --xla_cpu_parallel_codegen_split_count=1"
 # Later versions have one way only; what XLA does not know ends the process.
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
     COMPILED_FOR_TESTS += " --xla_cpu_use_fusion_emitters=false"
-
-# The same holds for kernels: two thirds of the time without the later optimisations, and a quarter with none, which run five times
-# as long. That repays in all rooms but those where trajectories are followed in bulk.
-KERNELS_COMPILED_FOR_TESTS, KERNELS_OF_MANY_STEPS = "-O0", "-O1 -fno-slp-vectorize"
-OF_MANY_STEPS = {"attractors", "kicks", "maps", "steppers", "verdicts"}
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`
 # compiles come a while after it, or two workers would compile that at the same time.
@@ -55,22 +50,17 @@ def pytest_configure(config: pytest.Config) -> None:
     # Studies of minutes are worth optimising.
     if "not slow" in config.option.markexpr:
         os.environ.setdefault(FLAGS, COMPILED_FOR_TESTS)
-        os.environ.setdefault(KERNEL_FLAGS, KERNELS_COMPILED_FOR_TESTS)
     if CACHE not in os.environ:
         os.environ[CACHE] = config.stash[_FOLDER] = tempfile.mkdtemp(prefix="fivjax-compiled-")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _kernels_of_a_room(request):
-    """Kernels that run long are compiled with more care, unless told how."""
-    told = os.environ.get(KERNEL_FLAGS)
-    if told == KERNELS_COMPILED_FOR_TESTS and request.path.parent.name in OF_MANY_STEPS:
-        os.environ[KERNEL_FLAGS] = KERNELS_OF_MANY_STEPS
-        yield
-        os.environ[KERNEL_FLAGS] = told
-    else:
-        yield
+@pytest.fixture(scope="session", autouse=True)
+def _no_kernel_is_thorough_at_once():
+    """The same holds for kernels: those of trajectories, too, are compiled quickly until they have run for long."""
+    from fivjax.simulation import motion
+
+    motion._by_kernel.thoroughly = False
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -106,17 +106,16 @@ def c_function(source: str, name: str, types: Sequence, flags: str) -> Callable:
 
     **Raises:** `OSError` where no folder has room for compiling it.
     """
-    own = compiler()
+    own, code = compiler(), f"{_declarations()}\n{source}"
     assert own is not None
-    code = f"{_declarations()}\n{source}"
-    digest = hashlib.sha256("\0".join((code, flags, own.target)).encode()).hexdigest()[:40]
+    digest = _digest(own, code, flags)
     module = f"fivjax_{digest}".encode()
     # Others may be compiled meanwhile.
     with _beginning:
         loading = _LOADING.setdefault(module, threading.Lock())
     with loading:
         if module not in _LOADED:
-            place = place_of_code(f"kernel-{digest}")
+            place = _place(digest)
             kept = None if place is None else read_kept(place)
             # What cannot be loaded is compiled anew.
             if kept is None or not _loaded(own, kept, module):
@@ -128,6 +127,21 @@ def c_function(source: str, name: str, types: Sequence, flags: str) -> Callable:
             _LOADED.add(module)
         address = _address(own, module, name.encode())
     return ctypes.CFUNCTYPE(None, *types)(address)
+
+
+def is_kept(source: str, flags: str) -> bool:
+    """Whether an earlier process has left what `c_function` compiles of this code."""
+    own = compiler()
+    place = None if own is None else _place(_digest(own, f"{_declarations()}\n{source}", flags))
+    return place is not None and place.is_file()
+
+
+def _digest(own: Compiler, code: str, flags: str) -> str:
+    return hashlib.sha256("\0".join((code, flags, own.target)).encode()).hexdigest()[:40]
+
+
+def _place(digest: str) -> Path | None:
+    return place_of_code(f"kernel-{digest}")
 
 
 def _address(own: Compiler, module: bytes, name: bytes) -> int:
@@ -145,13 +159,20 @@ def _compiled(own: Compiler, code: str, flags: str, kept: Path | None) -> bytes:
         try:
             with own_folder(parent) as folder:
                 paths = (str(folder / name).encode() for name in ("code.cpp", "headers", "code.o"))
-                fixed = False, False, True, True, options, 3, False, False, None, 1
+                # How much thought is given to the processor's instructions.
+                level = 0 if _level(flags) == "-O0" else 3
+                fixed = False, False, True, True, options, level, False, False, None, 1
                 if own.library.wp_compile_cpp(code.encode(), *paths, *fixed):
                     raise RuntimeError("Code of a kernel does not compile; please report it.")
                 return (folder / "code.o").read_bytes()
         except OSError as error:
             failures.append(f"{parent}: {error.strerror or error}")
     raise OSError(f"Kernels cannot be built, because no folder has room for that ({'; '.join(failures)})")
+
+
+def _level(flags: str) -> str | None:
+    """The level of optimisation that these options ask for: the last one counts."""
+    return next((flag for flag in reversed(flags.split()) if flag.startswith("-O")), None)
 
 
 def _with_room(failures: list[str], kept: Path | None) -> Iterator[Path]:

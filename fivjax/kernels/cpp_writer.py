@@ -19,6 +19,7 @@ from jax.extend.core import Jaxpr, Literal
 from ..foundation.jaxprs import within
 from . import cpp_lanes
 from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, has_known_numbers, natural, of_numbers
+from .cpp_fused import fused
 from .cpp_lanes import KINDS, OF_LANES, REALS
 from .cpp_numbers import (
     BY_NUMBER,
@@ -77,7 +78,7 @@ class Writer:
 
     @property
     def source(self) -> str:
-        return "\n".join([*self.functions.values(), *self._before, *self.lines])
+        return "\n".join([*self.functions.values(), *fused([*self._before, *self.lines])])
 
     def put(self, line: str) -> None:
         self.lines.append("  " * len(self._blocks) + line)

@@ -34,9 +34,11 @@ class KernelFunction:
     one `scan` goes along, so that one kernel serves any number of them. Real numbers are in double precision.
     """
 
-    def __init__(self, function: Callable, differentiated: Callable | None = None):
-        """`differentiated` is the function whose derivatives are taken, if it is another: with shorter steps, say."""
-        self.function = function
+    def __init__(self, function: Callable, differentiated: Callable | None = None, thoroughly: bool = False):
+        """`differentiated` is the function whose derivatives are taken, if it is another: with shorter steps, say. It is
+        compiled `thoroughly` at once where calls of it are all that users wait for (`TieredFunction`).
+        """
+        self.function, self.thoroughly = function, thoroughly
         self.differentiated = function if differentiated is None else differentiated
 
     def __call__(self, args: tuple, instants=NO_ROWS, *, own: tuple = (), by_kernel: bool = True):

@@ -80,7 +80,7 @@ class Kernel:
         # One program, as everything about a kernel that is traced.
         self.traced_results = jax.jit(self.results)
         names = [f"{name}_" for name in places], [f"{name}_" for name in sizes]
-        self.of_lanes = LaneFunction(body, *names, lanes, before)
+        self.of_lanes = LaneFunction(body, *names, lanes, before, function.thoroughly)
 
     def launched(
         self,

@@ -12,11 +12,14 @@ from itertools import pairwise
 import numpy as np
 
 from ..foundation.blocks import in_threads, workers
-from .c_functions import c_function, compiler
-from .warp_library import compiler_flags, launched, warp, warp_kernel
+from .c_functions import compiler
+from .tiered import TieredFunction
+from .warp_library import launched, warp, warp_kernel
 
 # Parts of a call's work for each thread, because some lanes take longer.
 AT_A_TIME = 4
+# For so many lanes, code is worth to be compiled thoroughly at once.
+MANY = 1000
 
 
 class LaneFunction:
@@ -26,13 +29,19 @@ class LaneFunction:
     """
 
     def __init__(
-        self, body: str, addresses: Sequence[str], numbers: Sequence[str] = (), side_by_side: int = 1, before: str = ""
+        self,
+        body: str,
+        addresses: Sequence[str],
+        numbers: Sequence[str] = (),
+        side_by_side: int = 1,
+        before: str = "",
+        thoroughly: bool = False,
     ):
         """For several lanes side by side, of which `lane` is the first, the body is told by `last` where they end at the
-        latest; that is for CPUs only. `before` are declarations.
+        latest; that is for CPUs only. `before` are declarations. `thoroughly` is as in `TieredFunction`.
         """
         self.body, self.addresses, self.numbers = body, tuple(addresses), tuple(numbers)
-        self.side_by_side, self.before = side_by_side, before
+        self.side_by_side, self.before, self.thoroughly = side_by_side, before, thoroughly
 
     @functools.cached_property
     def on_cpu(self) -> Callable:
@@ -50,7 +59,13 @@ class LaneFunction:
         )
         numbers = [ctypes.c_int32] * len(self.numbers)
         types = [ctypes.c_int32, ctypes.c_int32, *[ctypes.c_uint64] * len(self.addresses), *numbers]
-        return c_function(source, "of_lanes", types, compiler_flags())
+        return TieredFunction(source, "of_lanes", types, self.thoroughly)
+
+    def compile_for(self, lanes: int) -> None:
+        """Compile it for so many lanes on a CPU, before they come."""
+        own = self.on_cpu
+        if lanes >= MANY and isinstance(own, TieredFunction):
+            own.compile_thoroughly()
 
     @functools.cached_property
     def of_warp(self):
@@ -59,6 +74,7 @@ class LaneFunction:
 
     def in_parts(self, args: Sequence[int], lanes: int, parts: int, pool: Executor | None = None) -> None:
         """Run it on a CPU for so many lanes, in so many parts that threads share out: those of the pool, if there is one."""
+        self.compile_for(lanes)
         if parts <= 1:
             self.on_cpu(0, lanes, *args)
             return

@@ -97,12 +97,13 @@ def _init_elsewhere(wp) -> None:
             wp.config.kernel_cache_dir = before
 
 
-def compiler_flags() -> str:
-    """Those of all kernels on a CPU. What the environment says comes last, and so counts."""
+def compiler_flags(level: str = "-O3") -> str:
+    """Those of all kernels on a CPU, at a level of optimisation. What the environment says comes last, and so counts."""
     # Products and sums in one, and more of the compiler's thought: each makes steps a tenth faster. Loops over few coordinates
     # are slower in vectors: an energy ledger takes five times as long. What is compared with itself is compared to see whether
     # it is a number.
-    return f"-O3 -march=native -fno-vectorize -ffp-contract=fast -w {os.environ.get(FLAGS, '')}"
+    own = os.environ.get(FLAGS, "")
+    return f"{'' if '-O' in own else level} -march=native -fno-vectorize -ffp-contract=on -w {own}"
 
 
 @functools.cache

@@ -58,8 +58,9 @@ class TrajectoryKernels:
         to_conclude = self._form(_conclude, (kick, progress, progress.t))
 
         def build():
-            kernel_of(_follow, to_follow, shared=self.shared, side_by_side=self.side_by_side).of_lanes.on_cpu  # noqa: B018
-            kernel_of(_conclude, to_conclude, shared=self.shared).of_lanes.on_cpu  # noqa: B018
+            following = kernel_of(_follow, to_follow, shared=self.shared, side_by_side=self.side_by_side)
+            for kernel in (following, kernel_of(_conclude, to_conclude, shared=self.shared)):
+                kernel.of_lanes.compile_for(len(kick))
 
         # What comes later is compiled meanwhile.
         self.pool.submit(build)

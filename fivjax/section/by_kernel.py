@@ -41,9 +41,13 @@ class SectionKernels:
 
     def begin_building(self) -> None:
         """Begin to compile the kernel in a thread, before it is needed."""
+        # An attractor takes some sixty motions to find.
+        motions = 60 * len(self.table)
         if self.pool is not None:
             self.pool.submit(
-                lambda: kernel_of(motion_to_section, self.form, side_by_side=self.side_by_side).of_lanes.on_cpu
+                lambda: kernel_of(motion_to_section, self.form, side_by_side=self.side_by_side).of_lanes.compile_for(
+                    motions
+                )
             )
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):

@@ -70,7 +70,7 @@ def _differentiated(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""],
     return _followed(args, instants, for_derivatives(args[3].method))
 
 
-_by_kernel = KernelFunction(_motion, _differentiated)
+_by_kernel = KernelFunction(_motion, _differentiated, thoroughly=True)
 
 
 def rows_by_kernel(
