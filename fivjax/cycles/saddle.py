@@ -17,7 +17,7 @@ from ..model.scene import Scene
 from ..section.return_maps import ReturnMaps, Section
 from .cycle import LimitCycle, limit_cycle_of, section_multipliers, under_final_load
 from .own_coordinates import in_own_coordinates
-from .search import MOST_CROSSINGS, NoLimitCycle, check_scene, limit_cycle
+from .search import MOST_CROSSINGS, NoLimitCycle, check_scene, limit_cycle, state_of
 
 # Points of the section that are looked at together.
 POINTS = 96
@@ -62,6 +62,8 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: boo
     narrow = ((1e-8, 1e-2), (1e-14, 1e-1))
     check_scene(scene)
     arguments.instance("cycle", cycle, LimitCycle | None, "a limit cycle, such as `fivjax.limit_cycle(scene)`, or None")
+    if cycle is not None:
+        state_of(scene, cycle.deviation, "cycle")
     _refuse_unstable_sliding(under_final_load(scene))
     cycle = limit_cycle(scene) if cycle is None else cycle
     edge = _Edge(scene, cycle)

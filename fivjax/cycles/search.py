@@ -135,7 +135,7 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
         raise TypeError(
             f"Argument `starts` must be a list of states `(2n,)` or trajectories, but is {arguments.describe(starts)}."
         )
-    given = [_state_of(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
+    given = [state_of(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
     return _met(scene, [*given, *_kicked(scene)], _at_random(scene)).cycles
 
 
@@ -264,7 +264,7 @@ def _released(
     tangential, _ = contact_coordinates(scene.structure)
     moved = np.zeros((len(speeds), len(rest)))
     moved[:, scene.structure.size + np.atleast_1d(tangential)] = np.outer(speeds, np.atleast_1d(scene.belt_speed))
-    given = [_state_of(scene, start) - rest for start in starts]
+    given = [state_of(scene, start) - rest for start in starts]
     return np.concatenate([np.asarray(_released_states(scene, np.asarray(loads))), moved, *np.array(given)[:, None]])
 
 
@@ -285,7 +285,8 @@ def _along_modes(scene: Scene, maps: ReturnMaps) -> Float[np.ndarray, "m 2n"]:
     return (factors[:, None, None] * units).real.reshape(-1, 2 * n)
 
 
-def _state_of(scene: Scene, start, name: str = "start") -> np.ndarray:
+def state_of(scene: Scene, start, name: str = "start") -> np.ndarray:
+    """The state that was given as a start, of this scene's size and finite."""
     if isinstance(start, Trajectory):
         start.refuse_batch("A start")
         start = np.concatenate([np.asarray(start.displacement)[-1], np.asarray(start.velocity)[-1]])
@@ -315,14 +316,14 @@ def _guess(maps: ReturnMaps, scene: Scene, start) -> tuple[Point, list[int]]:
     """A point of the section to begin at, and the numbers of crossings per period to try."""
     status, direction, only, own = None, None, np.zeros(1, int), 0
     if isinstance(start, LimitCycle):
-        _state_of(scene, start.deviation)
+        state_of(scene, start.deviation)
         own = start.crossings if start.kind == "periodic" else 0
         # The point of the other scene's cycle need not be on this scene's section, if an impact falls on the section.
         status, direction = start.contact.status, start.contact.direction
         start = np.asarray(sliding_state(scene, scene.load.final)) + start.deviation
     elif isinstance(start, tuple | list) and len(start) == 2:
         start, status = start
-    y = np.asarray(_state_of(scene, start) - np.asarray(sliding_state(scene, scene.load.final)))
+    y = np.asarray(state_of(scene, start) - np.asarray(sliding_state(scene, scene.load.final)))
     at = maps.in_contact(only, y[None])
     if status is not None:
         known = np.atleast_1d(arguments.numeric_array("start", status))

@@ -364,6 +364,13 @@ def test_what_is_no_cycle(paper_scene, given):
         fj.saddle_cycle(paper_scene, given)
 
 
+def test_a_cycle_of_another_structure(paper_scene):
+    cycle = fj.limit_cycle(paper_scene.replace(mu=0.2, belt_speed=1.0))
+    other = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0.0, -1.0], 0, 1)
+    with refused(ValueError, "`cycle`", "2 displacements"):
+        fj.saddle_cycle(fj.Scene(other, fj.Coulomb(0.2), 1.0, fj.ConstantLoad(1.0)), cycle)
+
+
 def in_names(scene):
     structure, one = scene.structure, lambda run: run.velocity[-1, 0]
     return {
