@@ -35,6 +35,17 @@ from .run_lock import RunLock
 
 KIND = "fivjax store"
 CHECKSUMS = "checksums"
+# Errors in reading a file that say nothing of what is in it.
+NOT_OF_THE_FILE = (
+    errno.EACCES,
+    errno.EPERM,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOMEM,
+    errno.EAGAIN,
+    errno.EINTR,
+    errno.ETIMEDOUT,
+)
 HOW_ON = "Delete it to begin the run anew, or give another path."
 
 
@@ -106,7 +117,9 @@ class Store:
                 if not self._chunk(name, number).exists():
                     raise FileNotFoundError(errno.ENOENT, "missing")
                 parts[name] = np.array(array[at]).ravel()
-            except Exception:  # a damaged chunk may raise any error in its decoder
+            except Exception as error:  # a damaged chunk may raise any error in its decoder
+                if isinstance(error, MemoryError) or getattr(error, "errno", None) in NOT_OF_THE_FILE:
+                    raise
                 file = self._chunk(name, number).relative_to(self.path)
                 # Without verdicts, none of its trajectories counts as run.
                 self._chunk("verdict", number).unlink(missing_ok=True)

@@ -1,5 +1,6 @@
 """Single bits flipped in what a map has kept: never a wrong result, never an error without a sentence."""
 
+import errno
 import random
 import shutil
 import warnings
@@ -111,6 +112,31 @@ def test_damaged_metadata_are_made_again_or_refused(paper_scene, tmp_path, jobs_
     flipped(path / store.CHECKSUMS, 100)
     with pytest.raises(ValueError, match="file `checksums` is not what was written"):
         the_map(paper_scene, path)
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), OSError(errno.EMFILE, "Too many open files")], ids=["memory", "files"]
+)
+def test_what_cannot_be_read_at_present_is_not_removed(paper_scene, tmp_path, jobs_run, monkeypatch, error):
+    pytest.importorskip("zarr")
+    path = tmp_path / "map.zarr"
+    the_map(paper_scene, path)
+    before = sorted(path.rglob("*"))
+
+    class Unreadable(dict):
+        def __getitem__(self, _):
+            raise error
+
+    recall = store.Store.recall
+
+    def recalled(self, places):
+        self.arrays = {name: Unreadable() for name in self.arrays}
+        return recall(self, places)
+
+    monkeypatch.setattr(store.Store, "recall", recalled)
+    with pytest.raises(type(error)):
+        the_map(paper_scene, path)
+    assert sorted(path.rglob("*")) == before
 
 
 def test_what_an_earlier_version_kept_is_recognised(paper_scene, tmp_path):
