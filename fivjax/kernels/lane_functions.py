@@ -45,7 +45,7 @@ class LaneFunction:
 
     @functools.cached_property
     def on_cpu(self) -> Callable:
-        """It for all lanes from one to before another, then its own arguments. Compiled when it is first asked for."""
+        """It for all lanes from one to before another, then its own arguments."""
         if compiler() is None:
             return functools.partial(launched, self.of_warp, "cpu")
         told = [*(f"unsigned long long {name}" for name in self.addresses), *(f"int {name}" for name in self.numbers)]
@@ -63,9 +63,8 @@ class LaneFunction:
 
     def compile_for(self, lanes: int) -> None:
         """Compile it for so many lanes on a CPU, before they come."""
-        own = self.on_cpu
-        if lanes >= MANY and isinstance(own, TieredFunction):
-            own.compile_thoroughly()
+        if isinstance(self.on_cpu, TieredFunction):
+            self.on_cpu.compiled(thoroughly=lanes >= MANY)
 
     @functools.cached_property
     def of_warp(self):

@@ -23,25 +23,25 @@ class TieredFunction:
     def __init__(self, source: str, name: str, types: Sequence, thoroughly: bool = False):
         """`thoroughly`: at once; as is what an earlier process has left."""
         self._told = source, name, types
-        self._quick = self._thorough = None
+        self._at_once = thoroughly or is_kept(source, compiler_flags(THOROUGHLY))
+        self._run: Callable | None = None
+        self._is_thorough = False
         self._spent, self._making = 0.0, threading.Lock()
-        if thoroughly or is_kept(source, compiler_flags(THOROUGHLY)):
-            self.compile_thoroughly()
-        else:
-            self._quick = c_function(*self._told, compiler_flags(QUICKLY))
 
     def __call__(self, *args) -> None:
-        run: Callable | None = self._thorough or self._quick
-        assert run is not None
+        run = self._run or self.compiled()
         begin = time.perf_counter()
         run(*args)
-        if self._thorough is None:
+        if not self._is_thorough:
             self._spent += time.perf_counter() - begin
             if self._spent > WORTH * len(self._told[0]):
-                self.compile_thoroughly()
+                self.compiled(thoroughly=True)
 
-    def compile_thoroughly(self) -> None:
-        """Now, if it is not yet. Other threads go on with what there is."""
+    def compiled(self, thoroughly: bool = False) -> Callable:
+        """It as it is compiled by now, or `thoroughly`. Threads that have it compiled quickly go on with that."""
+        thoroughly = thoroughly or self._at_once
         with self._making:
-            if self._thorough is None:
-                self._thorough = c_function(*self._told, compiler_flags(THOROUGHLY))
+            if self._run is None or (thoroughly and not self._is_thorough):
+                self._run = c_function(*self._told, compiler_flags(THOROUGHLY if thoroughly else QUICKLY))
+                self._is_thorough = thoroughly
+            return self._run
