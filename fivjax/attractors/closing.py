@@ -16,6 +16,8 @@ MOST_ITERATIONS = 30
 HALVINGS = 5
 # A cycle is closed if the return map misses its start by less than this share of its size.
 CLOSED = 1e-10
+# A cycle that was closed over several of its periods returns so nearly after one, where it is hardly stable.
+NEARLY = 1e-7
 # Newton's method stops when the distance no longer falls, or is below this.
 EXACT = 2e-15
 
@@ -45,6 +47,12 @@ class Closed(NamedTuple):
         """Which rows are cycles."""
         return self.residual <= CLOSED
 
+    def put(self, rows: Int[np.ndarray, " k"], other: "Closed", which: Bool[np.ndarray, " m"]) -> None:
+        """In place, those of another that are meant."""
+        self.at.put(rows, other.at.rows(which))
+        for own, new in zip(self[1:], other[1:], strict=True):
+            own[rows] = new[which]
+
     def fixed_point(self, row: int) -> FixedPoint | None:
         """One of them; None if it is none."""
         if not self.found[row]:
@@ -69,7 +77,14 @@ def close(maps: ReturnMaps, group: Int[np.ndarray, " m"], guess: Section, crossi
             continue
         at = best.at.rows(rows)
         image = maps.returns(group[rows], at, count).at
-        rows = rows[(_closing_error(maps, at, image) <= CLOSED) & _alike(image, at)]
+        error, alike = _closing_error(maps, at, image), _alike(image, at)
+        nearly = rows[(error > CLOSED) & (error <= NEARLY) & alike]
+        if len(nearly):
+            again = _newton(maps, group[nearly], best.at.rows(nearly), np.full(len(nearly), count), patient)
+            same = again.found & (_closing_error(maps, best.at.rows(nearly), again.at) <= NEARLY)
+            best.put(nearly[same], again, same)
+            open_[nearly[same]] = False
+        rows = rows[(error <= CLOSED) & alike]
         if len(rows):
             image, time, derived = maps.derived(group[rows], best.at.rows(rows), count)
             missed = _closing_error(maps, best.at.rows(rows), image)

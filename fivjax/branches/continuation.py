@@ -10,7 +10,6 @@ import contextlib
 from typing import TYPE_CHECKING
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from ..attractors.closing import closed_at
@@ -31,8 +30,8 @@ from ..model.directions import direction_of
 from ..model.scene import Scene, check_corners, scene_in_contact_coordinates
 from ..section.about_sliding import sliding_state
 from ..section.crossings import Point as SectionPoint
+from ..section.free_directions import snapped_to_section
 from ..section.return_maps import ReturnMaps
-from ..simulation.start import snapped_to_belt
 from .branch_points import BranchPoint, point_through
 from .following import HalfBranch, follow_branch
 from .multiple_shooting import Mode, Phases
@@ -196,10 +195,10 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     scene = scene_in_contact_coordinates(given)
     state = np.asarray(row["state"])
     if scene is not given:
-        state = np.asarray(snapped_to_belt(scene, jnp.asarray(to_contact_coordinates(given.structure, state))))
+        state = np.asarray(to_contact_coordinates(given.structure, state))
     y = state - np.asarray(sliding_state(scene, scene.load.final))
     contact = Contact(np.asarray(row["status"].values, np.int32), np.asarray(row["direction"].values, float))
-    point = SectionPoint(np.asarray(y), contact)
+    point = SectionPoint(y if scene is given else snapped_to_section(scene, y, contact), contact)
     maps = ReturnMaps.of(scene)
     crossings = crossings_of(maps, point)
     if crossings is None:

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -18,6 +18,7 @@ from ..foundation.precision import in_double_precision
 from ..model.contact_coordinates import from_contact_coordinates, to_contact_coordinates, transformation
 from ..model.description import describe
 from ..model.scene import Scene, scene_in_contact_coordinates
+from ..section.free_directions import snapped_to_section
 from ..simulation.start import start_in_contact_coordinates
 from ..simulation.trajectory import Trajectory
 from .cycle import LimitCycle, under_final_load
@@ -42,8 +43,9 @@ def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
         for name in {"start", "cycle"} & set(names) & given.keys():
             given[name] = _inside(scene, given[name])
         # Anything else is refused by the function.
-        if "starts" in names and isinstance(given.get("starts"), tuple | list | np.ndarray):
-            given["starts"] = [_inside(scene, start) for start in given["starts"]]
+        starts = given.get("starts")
+        if "starts" in names and isinstance(starts, Iterable) and not isinstance(starts, str | Mapping):
+            given["starts"] = [_inside(scene, start) for start in starts]
         given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
         return _outside(scene, call(**given))
 
@@ -56,9 +58,9 @@ def cycle_in_contact_coordinates(cycle: LimitCycle) -> LimitCycle:
     if structure.contacts_at_coordinates:
         return cycle
     turned = functools.partial(to_contact_coordinates, structure)
-    return _turned(
-        cycle, scene_in_contact_coordinates(cycle.scene), turned, np.linalg.inv(transformation(structure)[0])
-    )
+    own = _turned(cycle, scene_in_contact_coordinates(cycle.scene), turned, np.linalg.inv(transformation(structure)[0]))
+    first = snapped_to_section(own.scene, np.asarray(own.points[0]), cycle.contact)
+    return dataclasses.replace(own, points=np.concatenate([first[None], own.points[1:]]))
 
 
 def cycle_in_own_coordinates(scene: Scene, cycle: LimitCycle) -> LimitCycle:

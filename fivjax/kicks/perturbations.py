@@ -20,7 +20,7 @@ from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates, sliding_states
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import MOST_IN_KICK
+from ..section.crossings import MOST_SEGMENTS
 from ..steppers.core import follow
 from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.kernel_scope import has_kernel
@@ -274,7 +274,9 @@ def _at_end(args, _):
         y, contact = carry
         # Loads are deviations from the final load.
         more, part = factor * scene.load.final, time / len(factors)
-        after = follow(for_derivatives(EXACT_STEPPER), mechanics, contact, more, y, part, most=MOST_IN_KICK, kind="lax")
+        after = follow(
+            for_derivatives(EXACT_STEPPER), mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax"
+        )
         return (after.y, after.contact), None
 
     sliding = Contact.sliding(jnp.sign(mechanics.belt_speed))

@@ -28,7 +28,7 @@ from ..model.directions import directions_of
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding, slowest_period
-from ..section.crossings import MOST_IN_KICK
+from ..section.crossings import MOST_SEGMENTS
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.kernel_scope import has_kernel
@@ -216,7 +216,7 @@ def _find_events(args, _):
             total=found,
             observe=observe,
             until=lambda found: found.count >= MOST_EVENTS,
-            most=MOST_IN_KICK,
+            most=MOST_SEGMENTS,
             kind="lax",
         )
         return (begin + h, after.y, after.contact, after.total), None
@@ -274,7 +274,7 @@ def _find_guard(args, _):
             total=happened,
             observe=lambda total, segment: total + jnp.any(segment.after.ended),
             until=lambda total: total >= events,
-            most=MOST_IN_KICK,
+            most=MOST_SEGMENTS,
             kind="lax",
         )
         # After the last event the motion goes on in this mode, regardless of its guards.

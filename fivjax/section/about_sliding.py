@@ -50,19 +50,28 @@ def weights_of(structure: Structure) -> Float[np.ndarray, " state"]:
 def longest_return(scene: Scene) -> Float[Array, ""]:
     r"""A time (s) within which any sustained motion crosses the section.
 
-    A hundred periods of the slowest coordinate, all others held, and twice the time for which a contact sticks on a slow belt,
-    from one edge of the friction cone to the other: $2 μ N / (k |v|)$ with the normal force of steady sliding and the stiffness
-    $k$ along the belt.
+    A hundred periods of the slowest vibration, and twice the time for which a contact sticks on a slow belt, from one edge of
+    the friction cone to the other: $2 μ N / (k |v|)$ with the normal force of steady sliding and the stiffness $k$ along the
+    belt. That period is bounded by $2 π$ times the root of the trace of $K^{-1} M$ in sliding, which is the sum of all
+    $1/ω^2$; and by that of the slowest coordinate, all others held.
     """
+    # Beyond this ratio of squared periods it is the rounding of what no spring holds.
+    most_apart = 1e12
     structure = scene.structure
     tangential, _ = contact_coordinates(structure)
     free = free_in_sliding(structure)
     stiffness = structure.stiffness[jnp.ix_(free, free)]
     along = np.searchsorted(free, tangential)
-    compliance = solve(stiffness, jnp.eye(len(free))[:, along])[along]
+    inverse = solve(stiffness, jnp.eye(len(free)))
+    held, modal = (
+        (slowest_period(structure) / (2 * math.pi)) ** 2,
+        jnp.sum(inverse * structure.mass[jnp.ix_(free, free)]),
+    )
+    slowest = jnp.sqrt(jnp.where((modal > held) & (modal < most_apart * held), modal, held))
+    compliance = inverse[along][..., along]
     compliance = jnp.diag(compliance) if jnp.ndim(compliance) else compliance
     _, force = steady_sliding(scene, scene.load.final)
     sticking = 2 * scene.friction.static * jnp.abs(force) * compliance / jnp.abs(scene.belt_speed)
     # Nothing is known of a structure that is held by no spring.
     sticking = jnp.max(jnp.where(jnp.isfinite(sticking), sticking, 0.0))
-    return 100 * slowest_period(structure) + 2 * sticking
+    return 100 * 2 * math.pi * slowest + 2 * sticking

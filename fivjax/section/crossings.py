@@ -20,10 +20,10 @@ from ..steppers.event_exact import EXACT_STEPPER, EventExact, for_derivatives
 from .about_sliding import longest_return, mechanics_about_sliding
 from .peak_speed import higher_peak
 
-# The most segments from one point of the section to the next: enough for hundreds of events.
-MOST_SEGMENTS = 4096
-# And during a kick, which may be long.
-MOST_IN_KICK = 64 * MOST_SEGMENTS
+# The most segments with events from one point of the section to the next; and the most of all: slow motions of structures with
+# fast modes have many without any event.
+MOST_EVENTS = 4096
+MOST_SEGMENTS = 64 * MOST_EVENTS
 
 
 class Point(eqx.Module):
@@ -66,7 +66,7 @@ class _Carry(NamedTuple):
     crossed: Int[Array, ""]
     events: Int[Array, ""]
     changes: Int[Array, ""]
-    segments: Int[Array, ""]  # since the last crossing
+    segments: Int[Array, ""]  # since the last crossing; one with an event counts for many
     peak: Float[Array, ""]
 
 
@@ -81,7 +81,7 @@ def to_crossing(
     peaks: bool | Bool[Array, ""] = False,
 ) -> tuple[Arrival, Crossing]:
     """The motion from a start to its `crossings`-th crossing of the section, for a time `longest` (s) at most, with
-    `MOST_SEGMENTS` segments from each crossing to the next; after a kick, if there is one.
+    `MOST_EVENTS` from each crossing to the next and `MOST_SEGMENTS`; after a kick, if there is one.
 
     Returns its end, and a row for each crossing with one of these `numbers`, of which 1 is the first. They rise, up to
     `crossings` at least. States of rows are NaN where the motion has not been. The largest speed is sought if `peaks` says so.
@@ -113,7 +113,7 @@ def to_crossing(
         # Where it is known, XLA computes nothing for it.
         known = isinstance(peaks, bool)
         peak = jax.lax.cond(peaks, higher, lambda: way.peak) if not known else higher() if peaks else way.peak
-        crosses = after.rise.happened & ~kicked
+        crosses, has_event = after.rise.happened & ~kicked, jnp.any(after.ended) & ~kicked
         counts_anew = crosses if kick is None else crosses | (kicked & (kick.duration <= 0))
         return _Carry(
             after.y,
@@ -121,16 +121,15 @@ def to_crossing(
             kick,
             left,
             way.crossed + crosses,
-            way.events + (jnp.any(after.ended) & ~kicked),
+            way.events + has_event,
             way.changes + (jnp.any(after.contact.status != way.contact.status) & ~kicked),
-            jnp.where(counts_anew, 0, way.segments + 1),
+            jnp.where(counts_anew, 0, way.segments + jnp.where(has_event, MOST_SEGMENTS // MOST_EVENTS, 1)),
             peak,
         )
 
     def until(way: _Carry, crossed) -> _Carry:
         def going(way: _Carry):
-            most = MOST_SEGMENTS if way.kick is None else jnp.where(way.kick.duration > 0, MOST_IN_KICK, MOST_SEGMENTS)
-            return (way.left > 0) & (way.crossed < crossed) & (way.segments < most)
+            return (way.left > 0) & (way.crossed < crossed) & (way.segments < MOST_SEGMENTS)
 
         return jax.lax.while_loop(going, further, way)
 

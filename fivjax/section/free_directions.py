@@ -7,7 +7,9 @@ subspace, with a basis that is orthonormal in weighted coordinates.
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..contact import Status
+from ..contact import Contact, Status
+from ..model.scene import Scene
+from ..model.sliding import contact_coordinates
 from ..steppers.section import section_weights
 
 
@@ -24,6 +26,23 @@ def zero_on_section(
     if np.ndim(tangential) == 0:
         return (closed[..., None] & (entries % size == normal)) | (entries == size + tangential)
     return (closed[..., None] & (entries % size == np.reshape(normal, (-1, 1)))).any(-2)
+
+
+def snapped_to_section(scene: Scene, y: Float[np.ndarray, " state"], contact: Contact) -> Float[np.ndarray, " state"]:
+    """A state of the section that a change of coordinates has rounded: what is zero there is zero again, and what sticks has
+    the belt's speed.
+    """
+    n, places = scene.structure.size, contact_coordinates(scene.structure)
+    speeds = y[n + places[0]]
+    zero = zero_on_section(n, *places, np.asarray(contact.status))
+    # An impact may make the velocity jump over zero.
+    rounding = 1e-9 * np.max(np.abs(y[n:]))
+    if np.ndim(places[0]) == 0:
+        zero[n + places[0]] = np.abs(speeds) <= rounding
+    snapped = np.where(zero, 0.0, y)
+    sticks = np.asarray(contact.status) == Status.STICK
+    snapped[n + places[0]] = np.where(sticks, scene.belt_speed, snapped[n + places[0]])
+    return snapped
 
 
 def section_row(size: int, tangential: int | Int[np.ndarray, " c"]) -> Float[np.ndarray, " n"]:

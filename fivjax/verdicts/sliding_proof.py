@@ -282,8 +282,7 @@ def _margin_share_nonlinear(modes: SlidingModes, modal: Pair) -> Float[Array, ""
     size = jnp.sum(weights * complex_pairs.size(modal))
     drive = jnp.sum(weights * complex_pairs.size(modes.remainder))
     bend = 0.5 * linear.pressing_margin * linear.remainder_curvature + linear.remainder_slope / balance
-    rate = -jnp.max(modes.eigenvalues.real)
-    return jnp.maximum(drive * bend * size / rate, size / (linear.reach * linear.slip_margin))
+    return jnp.maximum(_share_of_decay(modes, drive * bend * size), size / (linear.reach * linear.slip_margin))
 
 
 def _margin_share_of_several(modes: SlidingModes, modal: Pair) -> Float[Array, ""]:
@@ -297,8 +296,14 @@ def _margin_share_of_several(modes: SlidingModes, modal: Pair) -> Float[Array, "
     size = jnp.sum(weights * complex_pairs.size(modal))
     drive = complex_pairs.size(modes.remainder) @ weights
     bend = linear.remainder_slope + 0.5 * linear.remainder_curvature
+    return jnp.maximum(_share_of_decay(modes, jnp.sum(drive * bend) * size), size / linear.reach)
+
+
+def _share_of_decay(modes: SlidingModes, growth: Float[Array, ""]) -> Float[Array, ""]:
+    """A bound on growth (1/s) relative to the slowest decay rate. Where a mode does not decay, any growth is too much."""
     rate = -jnp.max(modes.eigenvalues.real)
-    return jnp.maximum(jnp.sum(drive * bend) * size / rate, size / linear.reach)
+    share = growth / jnp.where(rate > 0, rate, 1.0)
+    return jnp.where(rate > 0, share, jnp.where(growth == 0, 0.0, jnp.inf))
 
 
 def _largest(shares, margin: Float[Array, " contacts"]) -> Float[Array, " k"]:

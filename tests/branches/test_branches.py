@@ -13,6 +13,7 @@ from fivjax.branches.special_points import pairing
 from fivjax.model import own_structures
 from tests.helpers import oracle, reference
 from tests.helpers.catalogue import full_matrices
+from tests.helpers.general_coordinates import in_general_coordinates
 from tests.helpers.reference import cycles
 from tests.helpers.reference.cycles import stored
 
@@ -77,6 +78,16 @@ def test_special_points_have_the_derivatives_that_scaling_demands(branch):
         # Time is measured anew: masses by s², dampers by s, and the belt by 1/s.
         change = sum(share * values[n] * stiffer[n] for n, share in zip(values, (2, 2, 1, 1, 0, 0), strict=True))
         assert change == pytest.approx(float(slope.sel(of="belt_speed")), rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_cycle_at_gives_the_cycle_back_in_other_coordinates(cycle, seed):
+    turn, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    structure = in_general_coordinates(cycle.scene.structure, turn)
+    scene = fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.ConstantLoad(100.0))
+    branch = fj.continue_cycle(scene, "mu", (0.199, 0.202), points=3)
+    for i in range(branch.sizes["point"]):
+        assert fj.cycle_at(branch, i).period == pytest.approx(float(branch.period[i]), rel=1e-9)
 
 
 @pytest.mark.slow

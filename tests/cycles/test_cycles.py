@@ -17,6 +17,7 @@ from fivjax.cycles.torus import off_the_curve
 from fivjax.section.return_maps import Section
 from tests.helpers import reference
 from tests.helpers.catalogue import full_matrices
+from tests.helpers.general_coordinates import in_general_coordinates
 from tests.helpers.reference.cycles import stored
 from tests.helpers.several_contacts import copies
 
@@ -295,6 +296,17 @@ def test_derivatives_are_those_of_differences(cycle, multipliers):
             np.testing.assert_allclose(slopes.multipliers[name][:2], expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_derivatives_do_not_depend_on_coordinates(cycle, seed):
+    """A change of coordinates rounds the point on the section to just before it in half of these."""
+    turn, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    structure = in_general_coordinates(cycle.scene.structure, turn)
+    turned = fj.limit_cycle(fj.Scene(structure, fj.Coulomb(0.227), 1.0, fj.ConstantLoad(100.0)))
+    expected, found = (fj.cycle_derivatives(one, ["mu", "belt_speed"]) for one in (cycle, turned))
+    assert found.period == pytest.approx(expected.period, rel=1e-9)
+    assert found.amplitude == pytest.approx(expected.amplitude, rel=1e-9)
+
+
 @pytest.mark.slow
 def test_the_paper_s_cycle_loses_its_stability_in_a_neimark_sacker_bifurcation():
     """A complex pair leaves the unit circle between 1.6 and 3 m/s: below that speed it is inside, above outside."""
@@ -342,6 +354,22 @@ def test_a_phase_that_an_event_ends_where_the_section_is_counts_twice(contacts, 
     sticking = (fj.Status.SLIDE,) * (contacts - 1) + (fj.Status.STICK,)
     assert found[1].status == (sticking if contacts > 1 else fj.Status.STICK)
     assert found[0].status == ((fj.Status.SLIDE,) * contacts if contacts > 1 else fj.Status.SLIDE)
+
+
+@pytest.mark.parametrize("fast", [2e4, 5e4])
+def test_a_contact_that_is_coupled_stiffly_to_a_slow_body(fast):
+    """A period has tens of thousands of the fast mode's, and hundreds of those of each coordinate with all others held."""
+    node, body, soft, rate = 0.01, 1.0, 1e3, 2 * np.pi * fast
+    between = np.array([[1.0, 0.0, -1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 1.0]])
+    stiffness = node * rate**2 * between + np.diag([0.0, 1e6, soft])
+    damping = 0.1 * node * rate * between + np.diag([0.0, 10.0, 0.0])
+    structure = fj.Structure(np.diag([node, 0.01, body]), damping, stiffness, [0.0, -1.0, 0.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.3, 0.6), 0.05, fj.ConstantLoad(20.0))
+    run = fj.simulate(scene, 3.0, 1e-3, y0=np.array([7.2e-3, 0.0, 7.2e-3, 0.05, 0.0, 0.05]))
+    tangential = run.velocity[:, 0]
+    rises = run.t[1:][(tangential[:-1] < 0) & (tangential[1:] >= 0)]
+    cycle = fj.limit_cycle(scene, start=run)
+    assert cycle.crossings == 1 and cycle.period == pytest.approx(np.diff(rises)[-4:].mean(), rel=3e-3)
 
 
 @pytest.mark.slow

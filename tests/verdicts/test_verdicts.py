@@ -25,6 +25,34 @@ def brute_force_peak(shares, eigenvalues, t_end=40.0, points=400_001):
     return np.abs(sum(a * np.exp(ev * t) for a, ev in zip(shares, eigenvalues, strict=True))).max()
 
 
+class FlatAtTheBelt(fj.AbstractFriction):
+    """A smooth law that does not change at first order about a slip speed of 1 m/s."""
+
+    least: float
+    depth: float
+    smooth = True
+
+    def __call__(self, v):
+        return self.least - self.depth * jnp.tanh((v - 1.0) / 0.3) ** 3
+
+    @property
+    def static(self):
+        return self.least + self.depth
+
+    def variation(self, v):
+        return 10.0 * self.depth + 0.0 * v, 140.0 * self.depth + 0.0 * v
+
+
+def test_without_damping_sliding_is_not_proved_where_friction_varies():
+    """Nothing decays, so that any growth is too much: kicks end in squeal, however small."""
+    structure = fj.belt_oscillator(c1=0.0, c2=0.0)
+    scene = fj.Scene(structure, FlatAtTheBelt(0.12, 0.08), 1.0, fj.Pulse(force=100.0, p=1.05))
+    m = fj.bistability_map(scene, p=[1.01, 1.05], progress=False)
+    speeds = np.abs(fj.simulate(scene.replace(p=1.01), 20.0, 1e-3).velocity[:, 0])
+    assert speeds[-1000:].max() > 10 * speeds[200:1000].max()
+    assert (m["verdict"].values != fj.Verdict.SLIDING).all()
+
+
 @pytest.mark.parametrize("apart", [20.0, 3.0, 0.3, 1e-2, 1e-4])
 def test_the_envelope_is_a_bound_and_a_tight_one(apart):
     """Too low a bound would prove what is false; too high a one costs hundreds of cycles near the stability limit."""
