@@ -90,9 +90,11 @@ class LimitCycle(eqx.Module):
 
     @property
     def unstable_directions(self) -> int:
-        """The number of multipliers outside the unit circle: of independent small deviations that grow."""
+        """The number of multipliers outside the unit circle: of independent small deviations that grow; none of a torus."""
+        if self.kind != "periodic":
+            return 0
         values = section_multipliers(self.return_jacobian)
-        return int(np.sum(np.abs(values) > 1.0))
+        return int(np.sum(np.abs(values) > 1.0 + stability_margin(np.size(self.contact.status))))
 
     @property
     def in_family(self) -> bool:

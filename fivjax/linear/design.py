@@ -189,7 +189,8 @@ def _design(structure: Structure, within: "_Bounds", tied, goal: _Goal, steps: i
         reached = quantity(structure.replace(**values(shares)))
         return goal.loss(reached), reached
 
-    optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.01))
+    # Adam's own least size of a gradient, 1e-8, would depend on the unit of time.
+    optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.01), eps=np.finfo(float).tiny)
 
     @compiled
     def search(shares):

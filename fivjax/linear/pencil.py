@@ -138,7 +138,7 @@ class _Bases(NamedTuple):
     """
 
     right: "sparse.csc_array"  # Z
-    dual: "sparse.csc_array"  # Wₙᵀ dual = 1, and Zᵀ dual = 0
+    dual: "sparse.csc_array"  # Wₙᵀ dual = 1
     against: "sparse.csc_array"  # Wₜᵀ Z
     mixed: np.ndarray  # Wₜᵀ dual: not zero where a tangential direction is not at right angles to the normal ones
 
@@ -156,7 +156,10 @@ class _Bases(NamedTuple):
         # Only coordinates in which a normal direction has an entry are replaced; all others stay, so the matrices stay sparse.
         touched = np.flatnonzero(np.any(normal != 0, axis=1))
         others = np.setdiff1d(np.arange(system.size), touched)
-        kernel = null_space(normal[touched].T)
+        # In units in which all masses are one: coordinates may be metres and micrometres.
+        mass = _sparse_matrices(system)[0].diagonal()[touched]
+        size = 1 / np.sqrt(np.where(mass > 0, mass, mass.max(initial=0.0) or 1.0))[:, None]
+        kernel = size * null_space((size * normal[touched]).T)
         if kernel.shape[1] != len(touched) - normal.shape[1]:
             raise ValueError(
                 "The normal directions of the contacts must be linearly independent, but some follow from others."
@@ -172,9 +175,10 @@ class _Bases(NamedTuple):
             ),
             shape=(system.size, kernel.shape[1] + len(others)),
         )
-        dual = sparse.csc_array(np.linalg.pinv(normal).T)
+        dual = np.zeros(normal.shape)
+        dual[touched] = size * np.linalg.pinv(size * normal[touched]).T
         against = sparse.csc_array(sparse.csc_array(tangential.T) @ right)
-        return cls(right, dual, against, tangential.T @ dual.toarray())
+        return cls(right, sparse.csc_array(dual), against, tangential.T @ dual)
 
     def left(self, friction: np.ndarray) -> "sparse.csc_array":
         """Y at these σμ of the contacts."""

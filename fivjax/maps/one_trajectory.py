@@ -154,7 +154,7 @@ def with_step(setting: Setting, now: Progress) -> Progress:
     """The trajectory after one more step, which ends at the next event at the latest."""
     scene, method = setting.scene, setting.method
     # At rest an exact stepper would take a step that is too long to integrate work over it.
-    longest = method.dt if now.energy is None else min(method.dt, 1.0)
+    longest = method.dt if now.energy is None else jnp.minimum(method.dt, setting.shared.longest_return)
     t = next_step_end(scene.load, now.t, longest)
     load = scene.load(0.5 * (now.t + t)) - scene.load.final
     after = method.advance(setting.shared.mechanics, now.contact, load, now.y, t - now.t, at_section=True)

@@ -349,7 +349,9 @@ def _painleve_friction(structure: Structure):
     columns = jnp.eye(structure.size)[:, jnp.array([structure.tangential, structure.normal])]
     compliance = columns.T @ solve(structure.mass, columns)
     coupling = jnp.abs(compliance[0, 1])
-    return jnp.where(coupling == 0, jnp.inf, compliance[1, 1] / jnp.where(coupling == 0, 1.0, coupling))
+    # A change of coordinates leaves rounding.
+    least = 64 * jnp.finfo(coupling.dtype).eps * jnp.sqrt(compliance[0, 0] * compliance[1, 1])
+    return jnp.where(coupling <= least, jnp.inf, compliance[1, 1] / jnp.where(coupling <= least, 1.0, coupling))
 
 
 def refuse_several_contacts(structure: Structure, who: str, instead: str) -> None:

@@ -136,6 +136,22 @@ def test_units_of_mass_take_no_digits(mass):
     np.testing.assert_allclose(modes.damping_ratios[1:], ratio, rtol=1e-3)
 
 
+@pytest.mark.parametrize("contacts", [1, 2])
+def test_units_of_coordinates_take_no_digits(contacts):
+    """Contacts given by vectors, in general coordinates that are metres and micrometres."""
+    rng = np.random.default_rng(contacts)
+    n = 5
+    turn = (rng.normal(size=(n, n)) + 2 * np.eye(n)) * 10.0 ** rng.uniform(-6, 6, n)
+    matrices = [np.diag(rng.uniform(0.5, 2.0, n)), 0.02 * np.eye(n), np.diag(rng.uniform(1.0, 10.0, n))]
+    matrices[2] += 0.4 * (np.ones((n, n)) - np.eye(n))
+    plain = fj.Structure(*matrices, -np.ones(n), contacts=[fj.ContactPoint(2 * i, 2 * i + 1) for i in range(contacts)])
+    turned = [turn.T @ matrix @ turn for matrix in matrices]
+    vectors = [fj.ContactPoint(turn[2 * i], turn[2 * i + 1]) for i in range(contacts)]
+    general = fj.Structure(*(0.5 * (one + one.T) for one in turned), turn.T @ -np.ones(n), contacts=vectors)
+    expected, found = (fj.cea.complex_modes(one, 0.3).eigenvalues for one in (plain, general))
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+
+
 @pytest.mark.parametrize("direction", [1, -1])
 def test_one_contact_is_what_it_was(direction):
     """The sliding pencil of the belt oscillator has the eigenvalues of `cea.eigenvalues`, which come from the contact forces."""

@@ -115,6 +115,14 @@ def test_the_worst_growth_rate_is_lowered_to_the_bound():
     assert np.isclose(result.after, expected, rtol=1e-8)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e12])
+def test_a_design_does_not_depend_on_the_unit_of_time(unit):
+    structure = fj.belt_oscillator(c1=1.0 / unit, c2=1.0 / unit, k1=100e3 / unit**2, k2=101e3 / unit**2)
+    result = design.lower_growth_rate(structure, {"k1": (95e3 / unit**2, 105e3 / unit**2)}, mu=0.25, steps=40)
+    assert result.before * unit == pytest.approx(2.31526, rel=1e-5)
+    assert result.after * unit == pytest.approx(-0.905, abs=2e-3)
+
+
 BELT = fj.belt_oscillator()
 
 

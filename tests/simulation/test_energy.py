@@ -846,6 +846,21 @@ def test_a_map_keeps_the_ledger_of_each_lane(paper_scene):
 
 
 @pytest.mark.slow
+def test_energies_of_a_map_do_not_depend_on_the_unit_of_time(paper_scene):
+    slower = 1e6
+    mass, damping, stiffness, direction, *_ = map(np.asarray, paper_scene.structure.matrices)
+    structure = fj.Structure(mass, damping / slower, stiffness / slower**2, direction)
+    load = fj.Pulse(100.0 / slower**2, 1.3, float(paper_scene.load.duration) * slower)
+    slow = fj.Scene(structure, paper_scene.friction, float(paper_scene.belt_speed) / slower, load)
+    maps = [fj.bistability_map(one, p=[1.1, 1.3], energy=True, progress=False) for one in (paper_scene, slow)]
+    np.testing.assert_array_equal(maps[0]["verdict"], maps[1]["verdict"])
+    energies = [name for name, values in maps[0].items() if values.attrs.get("units") == "J" and "residual" not in name]
+    assert len(energies) > 5
+    for name in energies:
+        np.testing.assert_allclose(maps[1][name] * slower**2, maps[0][name], rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.slow
 def test_the_balance_closes_however_little_moves_under_however_high_a_load(paper_scene):
     """Kicks of nanoseconds under loads that store 10¹³ times what they move; and soft structures that fly off for ever.
 
