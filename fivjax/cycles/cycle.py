@@ -93,8 +93,8 @@ class LimitCycle(eqx.Module):
         """The number of multipliers outside the unit circle: of independent small deviations that grow; none of a torus."""
         if self.kind != "periodic":
             return 0
-        values = section_multipliers(self.return_jacobian)
-        return int(np.sum(np.abs(values) > 1.0 + stability_margin(np.size(self.contact.status))))
+        across = _across_cycle(self.return_jacobian, self.multipliers, self.contact)
+        return int(np.sum(np.abs(across) > 1.0 + stability_margin(np.size(self.contact.status))))
 
     @property
     def in_family(self) -> bool:
@@ -103,7 +103,8 @@ class LimitCycle(eqx.Module):
         """
         if self.kind != "periodic" or np.ndim(self.contact.status) == 0:
             return False
-        return bool(np.any(np.abs(section_multipliers(self.return_jacobian) - 1.0) < FAMILY_TOLERANCE))
+        across = _across_cycle(self.return_jacobian, self.multipliers, self.contact)
+        return bool(np.any(np.abs(across - 1.0) < FAMILY_TOLERANCE))
 
     def trajectory(self, points: int = 1000, *, periods: int = 1, energy: bool = False) -> Trajectory:
         """One period, or several, as a trajectory of `points` + 1 rows, the first and the last on the section.
@@ -249,12 +250,22 @@ def section_multipliers(jacobian: Float[np.ndarray, "state state"]) -> Complex[n
     return values[np.argsort(-np.abs(values), kind="stable")]
 
 
+def _across_cycle(jacobian: np.ndarray, multipliers: np.ndarray, contact: Contact) -> Complex[np.ndarray, " m"]:
+    """The multipliers of deviations across the cycle. With several contacts the return map's derivative is known from
+    differences only: they are Floquet multipliers but for the one along the cycle.
+    """
+    if np.ndim(contact.status) == 0 or not len(multipliers):
+        return section_multipliers(jacobian)
+    return np.delete(multipliers, np.argmin(np.abs(multipliers - 1.0)))
+
+
 @in_double_precision
 def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitCycle:
     """The limit cycle of a fixed point of the scene's return map."""
     point = closed.point
     seen = follow_period(scene, point, closed.period)
-    largest = np.abs(section_multipliers(closed.jacobian))[0]
+    multipliers = floquet_multipliers(scene, seen.segments, closed.period)
+    largest = np.max(np.abs(_across_cycle(closed.jacobian, multipliers, point.contact)), initial=0.0)
     points = np.asarray(point.y)[None]
     if closed.crossings > 1:
         _, more = maps.path(np.zeros(1, int), Section.of(point), closed.crossings - 1)
@@ -266,7 +277,7 @@ def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitC
         state=np.asarray(point.y) + _equilibrium(scene),
         contact=Contact(np.asarray(point.contact.status), np.asarray(point.contact.direction)),
         word=word(seen.segments),
-        multipliers=floquet_multipliers(scene, seen.segments, closed.period),
+        multipliers=multipliers,
         stable=bool(largest < 1 - stability_margin(np.size(point.contact.status))),
         amplitude=float(seen.amplitude),
         residual=closed.residual,

@@ -65,7 +65,8 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
     r"""A limit cycle of the scene under its final load.
 
     It is a fixed point $P(y) = y$ of the return map $P$ of the Poincaré section (where the tangential velocity rises through
-    zero), found by Newton's method with the exact derivative of $P$ through every contact event.
+    zero), found by Newton's method with the exact derivative of $P$ through every contact event (with several contacts, by
+    differences).
 
     **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene), or a
     pair of a state `(2n,)` in m and m/s and a status, of which what the status sets to zero, such as the gap, is not looked

@@ -33,7 +33,7 @@ from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EXACT_STEPPER, for_derivatives
 from ..steppers.kernel_scope import has_kernel
 
-# The most events that are compared; and the longest time in which two motions separate, in slowest periods.
+# The most events that are compared; and the longest time in which two motions separate, in longest returns to the section.
 MOST_EVENTS, MOST_TIME = 1024, 20.0
 # Events of two motions are the same if their times differ by no more than this share of the slowest period.
 TOGETHER = 1e-2
