@@ -160,7 +160,7 @@ def _compiled(own: Compiler, code: str, flags: str, kept: Path | None) -> bytes:
             with own_folder(parent) as folder:
                 paths = (str(folder / name).encode() for name in ("code.cpp", "headers", "code.o"))
                 # How much thought is given to the processor's instructions.
-                level = 0 if _level(flags) == "-O0" else 3
+                level = 0 if _level(flags) in ("-O0", "-O1") else 3
                 fixed = False, False, True, True, options, level, False, False, None, 1
                 if own.library.wp_compile_cpp(code.encode(), *paths, *fixed):
                     raise RuntimeError("Code of a kernel does not compile; please report it.")

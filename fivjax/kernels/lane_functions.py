@@ -59,7 +59,7 @@ class LaneFunction:
         )
         numbers = [ctypes.c_int32] * len(self.numbers)
         types = [ctypes.c_int32, ctypes.c_int32, *[ctypes.c_uint64] * len(self.addresses), *numbers]
-        return TieredFunction(source, "of_lanes", types, self.thoroughly)
+        return TieredFunction(source, "of_lanes", types, self.side_by_side > 1, self.thoroughly)
 
     def compile_for(self, lanes: int) -> None:
         """Compile it for so many lanes on a CPU, before they come."""

@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 from .c_functions import c_function, is_kept
 from .warp_library import compiler_flags
 
-# What is compiled quickly takes a third of the time to compile, and runs four times as long.
-QUICKLY, THOROUGHLY = "-O0", "-O3"
+# What is compiled quickly takes a third of the time to compile, and runs four times as long. Vectors, as of lanes side by side,
+# would run fifteen times as long without any optimisation.
+QUICKLY, QUICKLY_WITH_VECTORS, THOROUGHLY = "-O0", "-O1", "-O3"
 # About what it takes to compile thoroughly, in seconds for each character of code.
 WORTH = 6e-6
 
@@ -20,9 +21,9 @@ WORTH = 6e-6
 class TieredFunction:
     """A function as `c_function` has it, by source, name and types."""
 
-    def __init__(self, source: str, name: str, types: Sequence, thoroughly: bool = False):
-        """`thoroughly`: at once; as is what an earlier process has left."""
-        self._told = source, name, types
+    def __init__(self, source: str, name: str, types: Sequence, vectors: bool = False, thoroughly: bool = False):
+        """`thoroughly`: at once; as is what an earlier process has left. `vectors`: whether most numbers are vectors."""
+        self._told, self._quickly = (source, name, types), QUICKLY_WITH_VECTORS if vectors else QUICKLY
         self._at_once = thoroughly or is_kept(source, compiler_flags(THOROUGHLY))
         self._run: Callable | None = None
         self._is_thorough = False
@@ -42,6 +43,6 @@ class TieredFunction:
         thoroughly = thoroughly or self._at_once
         with self._making:
             if self._run is None or (thoroughly and not self._is_thorough):
-                self._run = c_function(*self._told, compiler_flags(THOROUGHLY if thoroughly else QUICKLY))
+                self._run = c_function(*self._told, compiler_flags(THOROUGHLY if thoroughly else self._quickly))
                 self._is_thorough = thoroughly
             return self._run
