@@ -80,7 +80,9 @@ class Kernel:
         # One program, as everything about a kernel that is traced.
         self.traced_results = jax.jit(self.results)
         names = [f"{name}_" for name in places], [f"{name}_" for name in sizes]
-        self.of_lanes = LaneFunction(body, *names, lanes, before, function.thoroughly)
+        # What processors hold in one register or two counts as a number.
+        vectors = lanes > 1 or width > 8
+        self.of_lanes = LaneFunction(body, *names, lanes, before, vectors, function.thoroughly)
 
     def launched(
         self,

@@ -35,13 +35,16 @@ class LaneFunction:
         numbers: Sequence[str] = (),
         side_by_side: int = 1,
         before: str = "",
+        vectors: bool = False,
         thoroughly: bool = False,
     ):
         """For several lanes side by side, of which `lane` is the first, the body is told by `last` where they end at the
-        latest; that is for CPUs only. `before` are declarations. `thoroughly` is as in `TieredFunction`.
+        latest; that is for CPUs only. `before` are declarations. `vectors` and `thoroughly` are as in
+        `TieredFunction`.
         """
         self.body, self.addresses, self.numbers = body, tuple(addresses), tuple(numbers)
-        self.side_by_side, self.before, self.thoroughly = side_by_side, before, thoroughly
+        self.side_by_side, self.before = side_by_side, before
+        self.vectors, self.thoroughly = vectors, thoroughly
 
     @functools.cached_property
     def on_cpu(self) -> Callable:
@@ -59,7 +62,7 @@ class LaneFunction:
         )
         numbers = [ctypes.c_int32] * len(self.numbers)
         types = [ctypes.c_int32, ctypes.c_int32, *[ctypes.c_uint64] * len(self.addresses), *numbers]
-        return TieredFunction(source, "of_lanes", types, self.side_by_side > 1, self.thoroughly)
+        return TieredFunction(source, "of_lanes", types, self.vectors, self.thoroughly)
 
     def compile_for(self, lanes: int) -> None:
         """Compile it for so many lanes on a CPU, before they come."""
