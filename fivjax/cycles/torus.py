@@ -98,24 +98,37 @@ def off_the_curve(path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]
 
 
 def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
-    """Turns per return: first from the angle about the mean, then so that the points in their order have the shortest path.
+    """Turns per return, so that the points in their order have the shortest path: next to those about the mean, or to a strong
+    line of the spectrum, which may be a harmonic. In some coordinates a curve does not go once around the mean.
 
     Without sign: a closed curve may be run through either way.
     """
+    most_lines, harmonics = 6, np.arange(1, 4)
     centred = weighted - np.mean(weighted, axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     plane = centred @ axes[:2].T
     angle = np.arctan2(plane[:, 1], plane[:, 0])
     turns = np.diff(np.unwrap(angle)) / (2 * np.pi)
-    guess = abs(smooth_mean(turns))
-    width = 1.0 / len(weighted)
+    count = len(weighted)
+    spectrum = np.sum(np.abs(np.fft.rfft(centred * np.hanning(count)[:, None], axis=0)) ** 2, axis=1)
+    inner = spectrum[1:-1]
+    peaks = 1 + np.flatnonzero((inner > spectrum[:-2]) & (inner >= spectrum[2:]))
+    lines = peaks[np.argsort(-spectrum[peaks])][:most_lines] / count
+    guesses = [abs(smooth_mean(turns)), *np.divide.outer(lines, harmonics).ravel()]
+    return min((_with_shortest_path(weighted, guess) for guess in guesses), key=lambda found: found[1])[0]
+
+
+def _with_shortest_path(weighted: Float[np.ndarray, "k state"], guess: float) -> tuple[float, float]:
+    """The turns per return next to a guess, and the length of the path."""
+    width, shortest = 1.0 / len(weighted), np.inf
     for _ in range(4):
         tried = guess + width * np.linspace(-1.0, 1.0, 33)
         orders = np.argsort(np.mod(tried[:, None] * np.arange(len(weighted)), 1.0), axis=1, kind="stable")
         lengths = np.sum(np.linalg.norm(np.diff(weighted[orders], axis=1), axis=-1), axis=1)
-        guess = tried[int(np.argmin(lengths))]
+        best = int(np.argmin(lengths))
+        guess, shortest = float(tried[best]), float(lengths[best])
         width /= 10.0
-    return float(guess)
+    return guess, shortest
 
 
 def _lyapunov_exponents(maps: ReturnMaps, path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]:

@@ -13,7 +13,7 @@ from fivjax.attractors.closing import close
 from fivjax.contact import Contact
 from fivjax.cycles import search
 from fivjax.cycles.one_period import PeriodSegments, word
-from fivjax.cycles.torus import off_the_curve
+from fivjax.cycles.torus import _rotation, off_the_curve
 from fivjax.section.return_maps import Section
 from tests.helpers import reference
 from tests.helpers.catalogue import full_matrices
@@ -189,6 +189,14 @@ def test_above_the_speed_where_it_loses_stability_the_cycle_is_a_torus():
     equilibrium = np.append(reference.linear(reference.of_scene(scene)).q_eq, np.zeros(3))
     away = np.linalg.norm(np.asarray(scene.structure.weights) * (torus.state - equilibrium) - path, axis=1).min()
     assert away < 1e-3 * size
+
+
+@pytest.mark.parametrize("harmonic", [1, 2, 3])
+def test_turns_per_return_are_those_of_the_curve_however_often_it_goes_around_its_mean(harmonic):
+    turns = 0.0717092
+    phase = 2 * np.pi * turns * np.arange(1024)
+    curve = [np.cos(phase), np.sin(phase), 3 * np.cos(harmonic * phase), 2 * np.sin(harmonic * phase + 0.3)]
+    assert _rotation(np.stack(curve, axis=1)) == pytest.approx(turns, abs=1e-6)
 
 
 def test_points_of_an_ellipse_lie_on_cubics_to_the_fourth_power_of_their_distance():
