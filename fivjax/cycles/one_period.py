@@ -18,7 +18,7 @@ from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import MOST_EVENTS, Point, motion_to_section
+from ..section.crossings import MOST_SEGMENTS, Point, motion_to_section
 from ..section.peak_speed import higher_peak
 from ..section.return_maps import known_for_section
 from ..steppers.event_exact import EXACT_STEPPER
@@ -97,7 +97,7 @@ def follow_period(scene: Scene, point: Point, period: float) -> PeriodSummary:
     most = least_segments
     while True:
         end, rows = _period(args, np.arange(float(most)), by_kernel=has_kernel(scene, EXACT_STEPPER))
-        if end.count < most or most > MOST_EVENTS or not np.all(np.isfinite(end.y)):
+        if end.count < most or most >= MOST_SEGMENTS or not np.all(np.isfinite(end.y)):
             break
         most *= 4
     found = PeriodSegments(*jax.tree.map(lambda row: np.asarray(row)[: int(end.count)], rows))

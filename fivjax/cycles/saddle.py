@@ -15,7 +15,7 @@ from ..foundation.progress import reported, stage
 from ..linear.linearisation import sliding_rates
 from ..model.scene import Scene
 from ..section.return_maps import ReturnMaps, Section
-from .cycle import LimitCycle, limit_cycle_of, section_multipliers, under_final_load
+from .cycle import LimitCycle, limit_cycle_of, section_multipliers, stability_margin, under_final_load
 from .own_coordinates import in_own_coordinates
 from .search import MOST_CROSSINGS, NoLimitCycle, check_scene, limit_cycle, state_of
 
@@ -176,7 +176,8 @@ class _Edge:
             closed = close_near(self.maps, self.in_contact(paths[0][place][None]).point(0), crossings)
             if closed is None:
                 continue
-            outside = int(np.sum(np.abs(section_multipliers(closed.jacobian)) > 1))
+            margin = stability_margin(np.size(closed.point.contact.status))
+            outside = int(np.sum(np.abs(section_multipliers(closed.jacobian)) > 1 + margin))
             away = np.linalg.norm(self.weights * np.asarray(closed.point.y) - path[place]) / sizes[place]
             if outside == 1 and away < 0.5:
                 return limit_cycle_of(self.maps, self.scene, closed)

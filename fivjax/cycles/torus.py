@@ -103,7 +103,7 @@ def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
 
     Without sign: a closed curve may be run through either way.
     """
-    most_lines, harmonics = 6, np.arange(1, 4)
+    most_lines = 4
     centred = weighted - np.mean(weighted, axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     plane = centred @ axes[:2].T
@@ -114,7 +114,9 @@ def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
     inner = spectrum[1:-1]
     peaks = 1 + np.flatnonzero((inner > spectrum[:-2]) & (inner >= spectrum[2:]))
     lines = peaks[np.argsort(-spectrum[peaks])][:most_lines] / count
-    guesses = [abs(smooth_mean(turns)), *np.divide.outer(lines, harmonics).ravel()]
+    # The turns of which a line is the first, second or third harmonic, of those that the returns cannot tell apart.
+    fundamentals = [lines, lines / 2, (1 - lines) / 2, lines / 3, (1 - lines) / 3, (1 + lines) / 3]
+    guesses = [abs(smooth_mean(turns)), *np.concatenate(fundamentals)]
     return min((_with_shortest_path(weighted, guess) for guess in guesses), key=lambda found: found[1])[0]
 
 

@@ -163,7 +163,9 @@ def _compiled(own: Compiler, code: str, flags: str, kept: Path | None) -> bytes:
                 level = 0 if _level(flags) in ("-O0", "-O1") else 3
                 fixed = False, False, True, True, options, level, False, False, None, 1
                 if own.library.wp_compile_cpp(code.encode(), *paths, *fixed):
-                    raise RuntimeError("Code of a kernel does not compile; please report it.")
+                    raise RuntimeError(
+                        f"Code of a kernel does not compile with the options {flags.strip()}; please report it."
+                    )
                 return (folder / "code.o").read_bytes()
         except OSError as error:
             failures.append(f"{parent}: {error.strerror or error}")

@@ -4,6 +4,7 @@ Most kernels of a first call run for milliseconds, and compiling them thoroughly
 same digits (`cpp_fused`), so that no result depends on when the one follows the other.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -35,14 +36,24 @@ class TieredFunction:
         run(*args)
         if not self._is_thorough:
             self._spent += time.perf_counter() - begin
-            if self._spent > WORTH * len(self._told[0]):
-                self.compiled(thoroughly=True)
+            if self._spent > WORTH * len(self._told[0]) and self._making.acquire(blocking=False):
+                # Where it cannot be compiled any more, as on a full disk, it goes on as it is.
+                try:
+                    self._compile(thoroughly=True)
+                except OSError:
+                    self._spent = -math.inf
+                finally:
+                    self._making.release()
 
     def compiled(self, thoroughly: bool = False) -> Callable:
-        """It as it is compiled by now, or `thoroughly`. Threads that have it compiled quickly go on with that."""
-        thoroughly = thoroughly or self._at_once
-        with self._making:
-            if self._run is None or (thoroughly and not self._is_thorough):
-                self._run = c_function(*self._told, compiler_flags(THOROUGHLY if thoroughly else self._quickly))
-                self._is_thorough = thoroughly
-            return self._run
+        """It as it is compiled by now, or `thoroughly`."""
+        if self._run is None or (thoroughly and not self._is_thorough):
+            with self._making:
+                self._compile(thoroughly or self._at_once)
+        assert self._run is not None
+        return self._run
+
+    def _compile(self, thoroughly: bool) -> None:
+        if self._run is None or (thoroughly and not self._is_thorough):
+            self._run = c_function(*self._told, compiler_flags(THOROUGHLY if thoroughly else self._quickly))
+            self._is_thorough = thoroughly

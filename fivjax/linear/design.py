@@ -143,7 +143,10 @@ def lower_growth_rate(
         values = real(frictions)
         return jnp.max(jax.vmap(lambda value: growth_rate(candidate, value, direction=direction))(values))
 
-    goal = _Goal("worst growth rate", quantity, target, direction, larger_is_better=False)
+    # Of growth rates, which are far smaller than the structure's own rates.
+    mass, _, stiffness, *_ = map(np.asarray, structure.matrices)
+    unit = 1e-4 * float(np.sqrt(np.max(np.abs(np.diag(stiffness) / np.diag(mass)))))
+    goal = _Goal("worst growth rate", quantity, target, direction, larger_is_better=False, unit=unit)
     return _design(structure, _checked_bounds(structure, bounds, tied), tied or {}, goal, steps, rate)
 
 
@@ -155,6 +158,7 @@ class _Goal(NamedTuple):
     target: float | None
     direction: int  # of the belt
     larger_is_better: bool
+    unit: float = 1.0  # that its gradient is measured in
 
     def loss(self, value):
         """What is minimised: constant beyond the target."""
@@ -167,7 +171,7 @@ def _design(structure: Structure, within: "_Bounds", tied, goal: _Goal, steps: i
     import optax
     import xarray as xr
 
-    name, quantity, target, direction, larger_is_better = goal
+    name, quantity, target, direction, larger_is_better, _ = goal
     names, low, width = within
     check_axis_names({*names, *tied}, ("step", name.replace(" ", "_")), "designs")
     arguments.whole_number("steps", steps, minimum=1)
@@ -189,8 +193,7 @@ def _design(structure: Structure, within: "_Bounds", tied, goal: _Goal, steps: i
         reached = quantity(structure.replace(**values(shares)))
         return goal.loss(reached), reached
 
-    # Adam's own least size of a gradient, 1e-8, would depend on the unit of time.
-    optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.01), eps=np.finfo(float).tiny)
+    optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.01), eps=1e-8 * goal.unit)
 
     @compiled
     def search(shares):

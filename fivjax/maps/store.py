@@ -45,6 +45,8 @@ NOT_OF_THE_FILE = (
     errno.EAGAIN,
     errno.EINTR,
     errno.ETIMEDOUT,
+    errno.ESTALE,
+    errno.EIO,
 )
 HOW_ON = "Delete it to begin the run anew, or give another path."
 

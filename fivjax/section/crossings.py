@@ -80,8 +80,8 @@ def to_crossing(
     kick: Kick | None = None,
     peaks: bool | Bool[Array, ""] = False,
 ) -> tuple[Arrival, Crossing]:
-    """The motion from a start to its `crossings`-th crossing of the section, for a time `longest` (s) at most, with
-    `MOST_EVENTS` from each crossing to the next and `MOST_SEGMENTS`; after a kick, if there is one.
+    """The motion from a start to its `crossings`-th crossing of the section, for a time `longest` (s) at most, and with at most
+    `MOST_SEGMENTS`, or `MOST_EVENTS`, from each crossing to the next; after a kick, if there is one.
 
     Returns its end, and a row for each crossing with one of these `numbers`, of which 1 is the first. They rise, up to
     `crossings` at least. States of rows are NaN where the motion has not been. The largest speed is sought if `peaks` says so.

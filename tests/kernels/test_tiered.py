@@ -2,13 +2,17 @@
 
 import ctypes
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.foundation.argument_forms import Form
 from fivjax.kernels import tiered
 from fivjax.kernels.c_functions import c_function
 from fivjax.kernels.cpp_fused import fused
+from fivjax.kernels.functions import KernelFunction
 from fivjax.kernels.lane_functions import MANY, LaneFunction
 from fivjax.kernels.tiered import TieredFunction
 from fivjax.kernels.warp_library import compiler_flags
@@ -88,6 +92,34 @@ def test_the_digits_do_not_depend_on_the_level(friction, monkeypatch):
         found[level] = [derivatives["belt_speed"], fj.simulate(scene, 0.5, 1e-2, energy=True).velocity]
     for quick, thorough in zip(*found.values(), strict=True):
         np.testing.assert_array_equal(quick, thorough)
+
+
+def test_powers_have_the_same_digits_at_every_level(monkeypatch):
+    """A compiler that knows them writes some as products, roots or other powers."""
+
+    def powers(args, instants):
+        (x,) = args
+        return (x**2.0, jax.lax.pow(x, 0.5), jax.lax.pow(x, -1.0), jnp.exp2(x), jax.lax.pow(4.0, x)), ()
+
+    found, rows = [], np.random.default_rng(1).uniform(0.1, 3.0, size=(5000, 8))
+    for level in ("-O0", "-O3"):
+        monkeypatch.setenv("FIVJAX_KERNEL_FLAGS", level)
+        found.append(KernelFunction(powers).of_many(Form.of((rows[0],))[0], rows)[0])
+    for quick, thorough in zip(*found, strict=True):
+        np.testing.assert_array_equal(quick, thorough)
+
+
+def test_where_nothing_more_can_be_compiled_it_goes_on_as_it_is(monkeypatch):
+    function, tried = TieredFunction(SOURCE, "tripled", TYPES), []
+    assert tripled(function) == 4.5
+
+    def full(*_):
+        tried.append(1)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tiered, "WORTH", 0.0)
+    monkeypatch.setattr(tiered, "c_function", full)
+    assert [tripled(function) for _ in range(3)] == [4.5] * 3 and len(tried) == 1
 
 
 def test_products_are_fused_where_nothing_is_written_between():
