@@ -63,10 +63,8 @@ def longest_return(scene: Scene) -> Float[Array, ""]:
     stiffness = structure.stiffness[jnp.ix_(free, free)]
     along = np.searchsorted(free, tangential)
     inverse = solve(stiffness, jnp.eye(len(free)))
-    held, modal = (
-        (slowest_period(structure) / (2 * math.pi)) ** 2,
-        jnp.sum(inverse * structure.mass[jnp.ix_(free, free)]),
-    )
+    held = (slowest_period(structure) / (2 * math.pi)) ** 2
+    modal = jnp.sum(inverse * structure.mass[jnp.ix_(free, free)])
     slowest = jnp.sqrt(jnp.where((modal > held) & (modal < most_apart * held), modal, held))
     compliance = inverse[along][..., along]
     compliance = jnp.diag(compliance) if jnp.ndim(compliance) else compliance

@@ -32,16 +32,13 @@ def snapped_to_section(scene: Scene, y: Float[np.ndarray, " state"], contact: Co
     """A state of the section that a change of coordinates has rounded: what is zero there is zero again, and what sticks has
     the belt's speed.
     """
-    n, places = scene.structure.size, contact_coordinates(scene.structure)
-    speeds = y[n + places[0]]
-    zero = zero_on_section(n, *places, np.asarray(contact.status))
-    # An impact may make the velocity jump over zero.
-    rounding = 1e-9 * np.max(np.abs(y[n:]))
-    if np.ndim(places[0]) == 0:
-        zero[n + places[0]] = np.abs(speeds) <= rounding
+    n, (tangential, normal) = scene.structure.size, contact_coordinates(scene.structure)
+    status = np.asarray(contact.status)
+    zero = zero_on_section(n, tangential, normal, status)
+    if jumped_to(y, np.asarray(scene.structure.weights), section_row(n, tangential), tangential):
+        zero[n + tangential] = False
     snapped = np.where(zero, 0.0, y)
-    sticks = np.asarray(contact.status) == Status.STICK
-    snapped[n + places[0]] = np.where(sticks, scene.belt_speed, snapped[n + places[0]])
+    snapped[n + tangential] = np.where(status == Status.STICK, scene.belt_speed, snapped[n + tangential])
     return snapped
 
 
