@@ -56,11 +56,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_kernel_is_thorough_at_once():
-    """The same holds for kernels: those of trajectories, too, are compiled quickly until they have run for long."""
+def _all_kernels_are_quick_at_first():
+    """The same holds for kernels: all are compiled quickly until they have run for long."""
+    from fivjax.kernels.tiered import QUICKLY
+    from fivjax.section.crossings import motion_to_section
     from fivjax.simulation import motion
 
-    motion._by_kernel.thoroughly = False
+    motion._by_kernel.level = motion_to_section.level = QUICKLY
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

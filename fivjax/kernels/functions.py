@@ -21,6 +21,7 @@ from ..foundation.precision import is_known, known_to_numpy
 from .code import jvp_along, with_slopes
 from .kernel import Groups, any_kernel_of, kernel_of, width_for
 from .primitive import is_real, values
+from .tiered import QUICKLY
 from .warp_library import gpus_for
 
 # The instants of a function without rows.
@@ -34,11 +35,11 @@ class KernelFunction:
     one `scan` goes along, so that one kernel serves any number of them. Real numbers are in double precision.
     """
 
-    def __init__(self, function: Callable, differentiated: Callable | None = None, thoroughly: bool = False):
-        """`differentiated` is the function whose derivatives are taken, if it is another: with shorter steps, say. It is
-        compiled `thoroughly` at once where calls of it are all that users wait for (`TieredFunction`).
+    def __init__(self, function: Callable, differentiated: Callable | None = None, level: str = QUICKLY):
+        """`differentiated` is the function whose derivatives are taken, if it is another: with shorter steps, say. `level` is
+        the first one at which it is compiled (`TieredFunction`).
         """
-        self.function, self.thoroughly = function, thoroughly
+        self.function, self.level = function, level
         self.differentiated = function if differentiated is None else differentiated
 
     def __call__(self, args: tuple, instants=NO_ROWS, *, own: tuple = (), by_kernel: bool = True):

@@ -16,6 +16,7 @@ from .c_functions import compiler
 from .code import source_from_plain, traced_source
 from .cpp_lanes import declarations
 from .lane_functions import AT_A_TIME, LaneFunction
+from .tiered import SOMEWHAT
 from .warp_library import gpus_for, warp
 from .xla_calls import Addresses
 
@@ -80,9 +81,9 @@ class Kernel:
         # One program, as everything about a kernel that is traced.
         self.traced_results = jax.jit(self.results)
         names = [f"{name}_" for name in places], [f"{name}_" for name in sizes]
-        # What processors hold in one register or two counts as a number.
-        vectors = lanes > 1 or width > 8
-        self.of_lanes = LaneFunction(body, *names, lanes, before, vectors, function.thoroughly)
+        # What processors hold in one register or two counts as a number, not as a vector.
+        level = max(function.level, SOMEWHAT) if lanes > 1 or width > 8 else function.level
+        self.of_lanes = LaneFunction(body, *names, lanes, before, level)
 
     def launched(
         self,

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..foundation.blocks import in_threads, workers
 from .c_functions import compiler
-from .tiered import TieredFunction
+from .tiered import QUICKLY, TieredFunction
 from .warp_library import launched, warp, warp_kernel
 
 # Parts of a call's work for each thread, because some lanes take longer.
@@ -35,16 +35,14 @@ class LaneFunction:
         numbers: Sequence[str] = (),
         side_by_side: int = 1,
         before: str = "",
-        vectors: bool = False,
-        thoroughly: bool = False,
+        level: str = QUICKLY,
     ):
         """For several lanes side by side, of which `lane` is the first, the body is told by `last` where they end at the
-        latest; that is for CPUs only. `before` are declarations. `vectors` and `thoroughly` are as in
-        `TieredFunction`.
+        latest; that is for CPUs only. `before` are declarations. `level` is the first one of a `TieredFunction`.
         """
         self.body, self.addresses, self.numbers = body, tuple(addresses), tuple(numbers)
         self.side_by_side, self.before = side_by_side, before
-        self.vectors, self.thoroughly = vectors, thoroughly
+        self.level = level
 
     @functools.cached_property
     def on_cpu(self) -> Callable:
@@ -62,7 +60,7 @@ class LaneFunction:
         )
         numbers = [ctypes.c_int32] * len(self.numbers)
         types = [ctypes.c_int32, ctypes.c_int32, *[ctypes.c_uint64] * len(self.addresses), *numbers]
-        return TieredFunction(source, "of_lanes", types, self.vectors, self.thoroughly)
+        return TieredFunction(source, "of_lanes", types, self.level)
 
     def compile_for(self, lanes: int) -> None:
         """Compile it for so many lanes on a CPU, before they come."""

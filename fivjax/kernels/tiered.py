@@ -12,9 +12,10 @@ from collections.abc import Callable, Sequence
 from .c_functions import c_function, is_kept
 from .warp_library import compiler_flags
 
-# What is compiled quickly takes a third of the time to compile, and runs four times as long. Vectors, as of lanes side by side,
-# would run fifteen times as long without any optimisation.
-QUICKLY, QUICKLY_WITH_VECTORS, THOROUGHLY = "-O0", "-O1", "-O3"
+# Levels of optimisation. What is compiled quickly takes a third of the time to compile, and runs four times as long. Some
+# optimisation is for what nearly every call runs for long, and for vectors, as of lanes side by side: these would run fifteen
+# times as long without any.
+QUICKLY, SOMEWHAT, THOROUGHLY = "-O0", "-O1", "-O3"
 # About what it takes to compile thoroughly, in seconds for each character of code.
 WORTH = 6e-6
 
@@ -22,10 +23,10 @@ WORTH = 6e-6
 class TieredFunction:
     """A function as `c_function` has it, by source, name and types."""
 
-    def __init__(self, source: str, name: str, types: Sequence, vectors: bool = False, thoroughly: bool = False):
-        """`thoroughly`: at once; as is what an earlier process has left. `vectors`: whether most numbers are vectors."""
-        self._told, self._quickly = (source, name, types), QUICKLY_WITH_VECTORS if vectors else QUICKLY
-        self._at_once = thoroughly or is_kept(source, compiler_flags(THOROUGHLY))
+    def __init__(self, source: str, name: str, types: Sequence, level: str = QUICKLY):
+        """`level`: the first one, unless an earlier process has left it compiled thoroughly."""
+        self._told, self._first_level = (source, name, types), level
+        self._at_once = level == THOROUGHLY or is_kept(source, compiler_flags(THOROUGHLY))
         self._run: Callable | None = None
         self._is_thorough = False
         self._spent, self._making = 0.0, threading.Lock()
@@ -55,5 +56,5 @@ class TieredFunction:
 
     def _compile(self, thoroughly: bool) -> None:
         if self._run is None or (thoroughly and not self._is_thorough):
-            self._run = c_function(*self._told, compiler_flags(THOROUGHLY if thoroughly else self._quickly))
+            self._run = c_function(*self._told, compiler_flags(THOROUGHLY if thoroughly else self._first_level))
             self._is_thorough = thoroughly

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..kernels.functions import KernelFunction
+from ..kernels.tiered import SOMEWHAT
 from ..model.scene import Scene
 from ..steppers.core import left_after, next_part
 from ..steppers.event_exact import EXACT_STEPPER, EventExact, for_derivatives
@@ -160,4 +161,4 @@ def _derived_to_section(args, numbers):
 
 # Of (scene, start, crossings, the longest time in s, whether the largest speed is asked for). In place of the scene there
 # may be what the motion needs of it: (mechanics, longest return in s).
-motion_to_section = KernelFunction(_to_section, _derived_to_section)
+motion_to_section = KernelFunction(_to_section, _derived_to_section, SOMEWHAT)

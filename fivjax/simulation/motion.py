@@ -17,6 +17,7 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.polynomial import value_and_rate
 from ..kernels.functions import KernelFunction
+from ..kernels.tiered import THOROUGHLY
 from ..model.load import load_from, next_jump
 from ..model.scene import Scene
 from ..steppers.base import advance_between
@@ -70,7 +71,7 @@ def _differentiated(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""],
     return _followed(args, instants, for_derivatives(args[3].method))
 
 
-_by_kernel = KernelFunction(_motion, _differentiated, thoroughly=True)
+_by_kernel = KernelFunction(_motion, _differentiated, THOROUGHLY)
 
 
 def rows_by_kernel(

@@ -56,7 +56,7 @@ def test_what_has_run_for_long_is_compiled_thoroughly(levels, monkeypatch):
 
 
 def test_what_is_asked_for_or_kept_is_thorough_at_once(levels, monkeypatch):
-    TieredFunction(SOURCE, "tripled", TYPES, thoroughly=True).compiled()
+    TieredFunction(SOURCE, "tripled", TYPES, tiered.THOROUGHLY).compiled()
     monkeypatch.setattr(tiered, "is_kept", lambda *_: True)
     TieredFunction(SOURCE, "tripled", TYPES).compiled()
     assert levels == ["-O3"] * 2
