@@ -94,72 +94,103 @@ def _following(
     load: Float[Array, ""],
     y: State,
     ended: Bool[Array, "*contacts 2"],
-    resolution,
+    resolution: Float[Array, ""],
 ) -> tuple[Contact, State]:
-    lifted = (contact.status == Status.SLIDE) & ended[..., 0]
     touched = (contact.status == Status.DETACH) & ended[..., 0]
     y_stopped = stopped(mechanics, contact, y, ended)
 
-    def struck():
-        fall, rate = _fall(mechanics, contact, load, y_stopped), gap_rate(mechanics, y_stopped)
-        # One that rises has landed by rounding, right after a rebound: in one that several impacts have made small nothing else
-        # would end it.
-        rising = touched & (rate >= 0)
-        if mechanics.several:
-            reached = affected_by(mechanics, touched)
-            # What a rebound changes that counts as rest is made up for by its end (`after_brief_flights`).
-            inelastic = _ends_within(resolution, -mechanics.restitution * rate, fall)
-            restitution = jnp.where(inelastic, 0.0, mechanics.restitution)
-            y_struck = impact(eqx.tree_at(lambda m: m.restitution, mechanics, restitution), y_stopped, reached)
-        else:
-            y_struck = jnp.where(rising, y_stopped, impact(mechanics, y_stopped))
-        own = gap_rate(mechanics, y_struck)
-        rests = rising | (touched & _ends_within(resolution, own, fall))
-        return with_contact_coordinates(
-            mechanics,
-            y_struck,
-            gap=gap(mechanics, y_struck),
-            gap_rate=jnp.where(rests, 0.0, own),
-            tangential_velocity=y_struck[degrees_of_freedom(y) + mechanics.tangential],
-        )
+    def struck() -> State:
+        return _struck(mechanics, contact, load, y_stopped, touched, resolution)
 
     # Where no force is in a contact yet that stuck, the edge of the cone that has ended says where it is pushed.
-    held = contact.status == Status.STICK
-    edge = jnp.where(held & ended[..., 1], -1.0, 1.0).astype(y.dtype)
-
-    # At the edge of the friction cone, or where N has just reached zero, rounding would decide whether the status that has
-    # ended goes on. So it is excluded.
+    edge = jnp.where((contact.status == Status.STICK) & ended[..., 1], -1.0, 1.0).astype(y.dtype)
     if mechanics.several:
         y_next = jax.lax.cond(jnp.any(touched), struck, lambda: y_stopped)
-        own = ended[..., 0] | ended[..., 1]
-        over = (own & held) | lifted
-        # Where slip has ended, the contact sticks if it can: where the static coefficient is larger, it could slide as well.
-        slides, slips = contact.status == Status.SLIDE, relative_velocity(mechanics, y) != 0
-        arrested = slides & slips & (relative_velocity(mechanics, y_next) == 0)
-        going_on = Contact(jnp.where(arrested, Status.STICK, contact.status), contact.direction)
-        following = modes_from_forces(mechanics, load, y_next, going_on, jnp.where(over, state_of(contact), NONE))
-        idle = own & held & _is_free_of_force(mechanics, load, y_next)
-        following = Contact(following.status, jnp.where(idle, edge, following.direction))
-        # What the event does not reach goes on: a contact whose mode ends at the same instant has an event of its own.
-        reached = affected_by(mechanics, own)
-        status = jnp.where(reached, following.status, contact.status).astype(contact.status.dtype)
-        following = Contact(status, jnp.where(reached, following.direction, contact.direction))
+        following = _modes_after(mechanics, contact, load, y, y_next, ended, edge)
     else:
         y_next = jnp.where(touched, struck(), y_stopped)
-        following = status_from_forces(mechanics, load, y_next, may_stick=~held, pushed=edge)
-        status = jnp.where(lifted, Status.DETACH, following.status)
-        rests = touched & (status != Status.DETACH)
+        # What has ended is excluded here, too.
+        following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK, pushed=edge)
+        status = jnp.where(_has_lifted(contact, ended), Status.DETACH, following.status)
         following = Contact(status.astype(contact.status.dtype), following.direction)
-        rate = gap_rate(mechanics, y_stopped)
-        # A rebound that counts as a landing as soon as it begins has its speed already.
-        rebound = jnp.where(rate < 0, -mechanics.restitution, 1.0) * rate
-
-        def rested():
-            by = after_brief_flights(mechanics, following, load, y_next)
-            return y_next.at[degrees_of_freedom(y) :].add(by * rebound)
-
-        y_next = jax.lax.cond(rests, rested, lambda: y_next)
+        rests = touched & (status != Status.DETACH)
+        y_next = jax.lax.cond(
+            rests, lambda: _rested(mechanics, following, load, gap_rate(mechanics, y_stopped), y_next), lambda: y_next
+        )
     return following, on_constraint(mechanics, following, y_next)
+
+
+def _has_lifted(contact: Contact, ended: Bool[Array, "*contacts 2"]) -> Bool[Array, "*contacts"]:
+    return (contact.status == Status.SLIDE) & ended[..., 0]
+
+
+def _struck(
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    touched: Bool[Array, "*contacts"],
+    resolution: Float[Array, ""],
+) -> State:
+    """The state after the impacts of the contacts that have `touched`."""
+    fall, rate = _fall(mechanics, contact, load, y), gap_rate(mechanics, y)
+    # One that rises has landed by rounding, right after a rebound: in one that several impacts have made small nothing else
+    # would end it.
+    rising = touched & (rate >= 0)
+    if mechanics.several:
+        reached = affected_by(mechanics, touched)
+        # What a rebound changes that counts as rest is made up for by its end (`after_brief_flights`).
+        inelastic = _ends_within(resolution, -mechanics.restitution * rate, fall)
+        restitution = jnp.where(inelastic, 0.0, mechanics.restitution)
+        y_struck = impact(eqx.tree_at(lambda m: m.restitution, mechanics, restitution), y, reached)
+    else:
+        y_struck = jnp.where(rising, y, impact(mechanics, y))
+    own = gap_rate(mechanics, y_struck)
+    rests = rising | (touched & _ends_within(resolution, own, fall))
+    return with_contact_coordinates(
+        mechanics,
+        y_struck,
+        gap=gap(mechanics, y_struck),
+        gap_rate=jnp.where(rests, 0.0, own),
+        tangential_velocity=y_struck[degrees_of_freedom(y) + mechanics.tangential],
+    )
+
+
+def _rested(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], rate: Float[Array, ""], y: State) -> State:
+    """The state of a contact that has come to rest from a landing at this rate: after the brief flights that it leaves out."""
+    # A rebound that counts as a landing as soon as it begins has its speed already.
+    rebound = jnp.where(rate < 0, -mechanics.restitution, 1.0) * rate
+    by = after_brief_flights(mechanics, contact, load, y)
+    return y.at[degrees_of_freedom(y) :].add(by * rebound)
+
+
+def _modes_after(
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    y_next: State,
+    ended: Bool[Array, "contacts 2"],
+    edge: Float[Array, " contacts"],
+) -> Contact:
+    """The modes of several contacts at `y_next`, after events of some of them at `y`."""
+    own, held = ended[..., 0] | ended[..., 1], contact.status == Status.STICK
+    # At the edge of the friction cone, or where N has just reached zero, rounding would decide whether the status that has
+    # ended goes on. So it is excluded.
+    over = (own & held) | _has_lifted(contact, ended)
+    # Where slip has ended, the contact sticks if it can: where the static coefficient is larger, it could slide as well.
+    slides, slips = contact.status == Status.SLIDE, relative_velocity(mechanics, y) != 0
+    arrested = slides & slips & (relative_velocity(mechanics, y_next) == 0)
+    # A contact that has landed is on the belt, also where no force presses it there.
+    landed = (contact.status == Status.DETACH) & ended[..., 0]
+    going_on = Contact(jnp.where(arrested | landed, Status.STICK, contact.status), contact.direction)
+    following = modes_from_forces(mechanics, load, y_next, going_on, jnp.where(over, state_of(contact), NONE))
+    idle = own & held & _is_free_of_force(mechanics, load, y_next)
+    following = Contact(following.status, jnp.where(idle, edge, following.direction))
+    # What the event does not reach goes on: a contact whose mode ends at the same instant has an event of its own.
+    reached = affected_by(mechanics, own)
+    status = jnp.where(reached, following.status, contact.status).astype(contact.status.dtype)
+    return Contact(status, jnp.where(reached, following.direction, contact.direction))
 
 
 def status_from_forces(

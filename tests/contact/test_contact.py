@@ -415,6 +415,28 @@ def test_touchdown_without_restitution_rests_on_the_belt():
     assert after[2] == pytest.approx(0.3 * 0.5, rel=ROUNDING)
 
 
+@pytest.mark.parametrize("slip", [0.0, 0.4])
+def test_of_several_contacts_too_one_that_has_landed_is_on_the_belt_where_nothing_presses_it(slip):
+    places = [fj.ContactPoint(0, 2), fj.ContactPoint(1, 3)]
+    two = fj.Structure(
+        np.eye(4), np.zeros((4, 4)), np.diag([1.0, 1.0, 0.0, 0.0]), [0.0, 0.0, -1.0, -1.0], contacts=places
+    )
+    scene = fj.Scene(two, fj.Coulomb(0.5), 1.0, fj.ConstantLoad(0.0))
+    with jax.enable_x64(True):
+        flying = Contact(jnp.full(2, Status.DETACH, jnp.int32), jnp.ones(2))
+        y = jnp.array([0.0, 0.0, 0.0, 0.3, 1.0 - slip, 1.0 - slip, -0.5, -0.5])
+        ended = jnp.array([[True, True], [False, False]])
+        contact, after = _transition(scene, flying, jnp.asarray(0.0), y, ended, jnp.asarray(0.0))
+        # One contact by itself does so.
+        one = fj.Structure(np.eye(2), np.zeros((2, 2)), np.diag([1.0, 0.0]), [0.0, -1.0], 0, 1)
+        single = fj.Scene(one, fj.Coulomb(0.5), 1.0, fj.ConstantLoad(0.0))
+        of_one = y[jnp.array([0, 2, 4, 6])]
+        alone, _ = _transition(single, as_contact(Status.DETACH), jnp.asarray(0.0), of_one, ended[0], jnp.asarray(0.0))
+    expected = Status.SLIDE if slip else Status.STICK
+    assert int(alone.status) == expected and np.asarray(contact.status).tolist() == [expected, Status.DETACH]
+    assert np.asarray(after)[6:].tolist() == [0.0, -0.5]
+
+
 def test_touchdown_of_a_slow_slip_sticks():
     """An impact that can end the slip does just that: friction does not drag the mass past the belt's velocity."""
     kind, _, after = transition(belt_block(BLOCK), Status.DETACH, 1.0, 10.0, [0.0, 0.0, 0.9, -0.5], [True, True])
