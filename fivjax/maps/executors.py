@@ -26,6 +26,9 @@ from ..foundation import arguments
 P = ParamSpec("P")
 R = TypeVar("R")
 
+# A job that is lost so often while others run is run alone, and one that is lost so often then is given up.
+MOST_LOSSES = 3
+
 
 def with_workers(function: Callable[P, R]) -> Callable[P, R]:
     """`function`, which gets `Workers` in place of the user's `executor`; they are closed when it ends."""
@@ -205,33 +208,12 @@ def hand_out(
     **Raises:** `KeyboardInterrupt` once `stop()` is true, or if a worker was interrupted; `RuntimeError` if there are no
     workers any more; `ValueError` where jobs cannot be sent to them; and anything that a job raises.
     """
-    waiting, suspects = deque(jobs), deque()
-    # How often each job was lost while others ran, and while it ran alone.
-    lost, lost_alone = Counter(), Counter()
+    waiting = _Waiting(jobs, given_up)
     under_way: dict[Any, int] = {}  # futures, in the order in which they were handed out
-    alone: int | None = None  # the job that runs alone
     back: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    most_losses = 3
     try:
-        while waiting or suspects or under_way:
-            # Where the number of workers is not known, so many jobs.
-            room = 512 if workers.side_by_side is None else workers.side_by_side + 1
-            chosen = waiting if waiting or under_way else suspects
-            while chosen and len(under_way) < (1 if chosen is suspects else room):
-                number = chosen[0]
-                alone = number if chosen is suspects else None
-                try:
-                    future = submit(number)
-                except Exception as error:
-                    if not is_broken(error):
-                        raise
-                    if not under_way:
-                        workers.renew()
-                        continue
-                    break  # the futures under way will report the same error
-                chosen.popleft()
-                under_way[future] = number
-                future.add_done_callback(back.put)
+        while waiting.any_left or under_way:
+            _submit_some(waiting, submit, workers, under_way, back)
             try:
                 # While no result arrives, requests to stop are looked for.
                 future = back.get(timeout=0.2)
@@ -246,25 +228,13 @@ def hand_out(
                 continue
             running = list(under_way)[: workers.side_by_side]
             number = under_way.pop(future)
-            try:
-                result = future.result()
-            except BaseException as caught:
-                if isinstance(caught, pickle.PicklingError) or (
-                    isinstance(caught, AttributeError | TypeError) and "pickle" in str(caught)
-                ):
-                    raise ValueError(
-                        f"The scene cannot be sent to the workers of `executor` ({caught}). Define its classes and functions "
-                        f"in a module that they can import, or take an executor that sends them by value, such as loky's."
-                    ) from caught
-                if not is_loss(caught):
-                    raise
-                error = caught
-            else:
+            result, loss = _result_or_loss(future)
+            if loss is None:
                 done(number, result)
                 workers.progressed()
                 continue
             gone = [(future, number)]
-            if is_broken(error):
+            if is_broken(loss):
                 # Jobs that were finished before the workers died still report their results.
                 gone += [one for one in under_way.items() if not _has_result(one[0])]
                 for one, _ in gone[1:]:
@@ -272,19 +242,87 @@ def hand_out(
                 workers.renew()
             for one, number in gone:
                 # Jobs begin in order, so only the first ones were running.
-                blamed = most_losses if was_tried_on_several(error) else int(one in running)
-                if number == alone:
-                    lost_alone[number] += blamed
-                else:
-                    lost[number] += blamed
-                if lost_alone[number] >= most_losses:
-                    given_up(number)
-                elif lost[number] >= most_losses:
-                    suspects.append(number)
-                else:
-                    waiting.append(number)
+                waiting.put_back(number, MOST_LOSSES if was_tried_on_several(loss) else int(one in running))
     finally:
         workers.take_back(under_way)
+
+
+class _Waiting:
+    """The jobs that are still to be run, and how often each was lost."""
+
+    def __init__(self, jobs: Sequence[int], given_up: Callable[[int], None]):
+        self._together, self._one_by_one = deque(jobs), deque()
+        self._lost, self._lost_alone = Counter(), Counter()
+        self._alone: int | None = None  # the job that runs alone
+        self._given_up = given_up
+
+    @property
+    def any_left(self) -> bool:
+        return bool(self._together or self._one_by_one)
+
+    def now(self, running: int, room: int) -> int | None:
+        """The job to be run next beside so many, if there is `room` for it."""
+        if self._together or running:
+            return self._together[0] if self._together and running < room else None
+        return self._one_by_one[0] if self._one_by_one else None
+
+    def begin(self, number: int) -> None:
+        """This job, the next one, is run."""
+        beside_others = bool(self._together)
+        (self._together if beside_others else self._one_by_one).popleft()
+        self._alone = None if beside_others else number
+
+    def put_back(self, number: int, blamed: int) -> None:
+        """This job was lost, and is so often `blamed` for it: it is run again, or given up."""
+        (self._lost_alone if number == self._alone else self._lost)[number] += blamed
+        if self._lost_alone[number] >= MOST_LOSSES:
+            self._given_up(number)
+        elif self._lost[number] >= MOST_LOSSES:
+            self._one_by_one.append(number)
+        else:
+            self._together.append(number)
+
+
+def _submit_some(
+    waiting: _Waiting,
+    submit: Callable[[int], Any],
+    workers: Workers,
+    under_way: dict[Any, int],
+    back: "queue.SimpleQueue[Any]",
+) -> None:
+    """Hand out as many jobs as there is room for; their futures come `back` when they are done."""
+    # Where the number of workers is not known, so many jobs.
+    room = 512 if workers.side_by_side is None else workers.side_by_side + 1
+    while (number := waiting.now(len(under_way), room)) is not None:
+        try:
+            future = submit(number)
+        except Exception as error:
+            if not is_broken(error):
+                raise
+            if under_way:
+                return  # the futures under way will report the same error
+            workers.renew()
+            continue
+        waiting.begin(number)
+        under_way[future] = number
+        future.add_done_callback(back.put)
+
+
+def _result_or_loss(future) -> tuple[Any, BaseException | None]:
+    """What a job has come to, or the error that says that it was lost."""
+    try:
+        return future.result(), None
+    except BaseException as error:
+        if isinstance(error, pickle.PicklingError) or (
+            isinstance(error, AttributeError | TypeError) and "pickle" in str(error)
+        ):
+            raise ValueError(
+                f"The scene cannot be sent to the workers of `executor` ({error}). Define its classes and functions "
+                f"in a module that they can import, or take an executor that sends them by value, such as loky's."
+            ) from error
+        if not is_loss(error):
+            raise
+        return None, error
 
 
 def _has_result(future) -> bool:
