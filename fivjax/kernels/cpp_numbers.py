@@ -62,7 +62,8 @@ BY_NUMBER = {
     "ceil": "wp::ceil({})",
     "max": "({0} > {1} ? {0} : {1})",
     "min": "({0} < {1} ? {0} : {1})",
-    "clamp": "({1} < {0} ? {0} : ({1} > {2} ? {2} : {1}))",
+    # The upper bound counts where the lower one is above it.
+    "clamp": "(({1} > {2}) | ({0} > {2}) ? {2} : ({1} < {0} ? {0} : {1}))",
     "lt": "{} < {}",
     "le": "{} <= {}",
     # Searches in tables compare so; they differ for what is no number only.
@@ -118,8 +119,14 @@ def text_of(entry) -> str:
     return f"({entry!r})"
 
 
-def keeping_nan(name: str, form: str, kind: str) -> str:
-    """The form of a primitive; of two numbers, the larger or smaller is no number where the first is none, as in JAX."""
+def form_for(name: str, form: str, kind: str) -> str:
+    """The form of a primitive for numbers of a type; of two, the larger or smaller is no number where the first is none, as in
+    JAX.
+    """
+    if name == "not" and kind not in ("bool", *cpp_lanes.KINDS):
+        return "~{}"
+    if name == "abs" and kind == cpp_lanes.WHOLES:
+        return "({0} < (wholes)(0) ? -{0} : {0})"
     if name in ("max", "min") and kind == cpp_lanes.REALS:
         return cpp_lanes.BY_NUMBER[name]
     return form.replace(" ?", " || {0} != {0} ?") if name in ("max", "min") and kind == "double" else form

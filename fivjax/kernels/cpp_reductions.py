@@ -6,8 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from .cpp_arrays import Value, View, has_known_numbers
-from .cpp_lanes import KINDS
-from .cpp_numbers import BY_NUMBER, converted, keeping_nan
+from .cpp_lanes import KINDS, TRUTHS
+from .cpp_numbers import BY_NUMBER, converted, form_for
 from .cpp_writer import FEW, Writer
 
 # Reductions, by the primitive that they repeat, and running totals.
@@ -46,12 +46,14 @@ def _in_loops(writer: Writer, name: str, value: View, axes) -> Value:
 def _written_in_loops(writer: Writer, name: str, value: View, axes) -> View:
     kept = [axis for axis in range(value.ndim) if axis not in axes]
     into = writer.new([value.shape[axis] for axis in kept], value.kind)
-    form = keeping_nan(name, BY_NUMBER[name], value.kind)
+    form = form_for(name, BY_NUMBER[name], value.kind)
     outer = writer.loops(into.shape)
     total = writer.name(value.kind, "s")
     neutral = {"add": "0", "mul": "1", "and": "true", "or": "false"}.get(name)
+    if name == "and" and value.kind not in ("bool", TRUTHS):
+        neutral = "~0"
     if neutral is not None and value.kind in KINDS:
-        neutral = converted(neutral, "bool", value.kind)
+        neutral = converted(neutral, "int" if neutral == "~0" else "bool", value.kind)
     first = dict.fromkeys(axes, "0") | dict(zip(kept, outer, strict=True))
     start = value.at([first[axis] for axis in range(value.ndim)]) if neutral is None else neutral
     writer.put(f"{value.kind} {total} = ({value.kind})({start});")

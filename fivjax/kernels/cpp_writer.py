@@ -30,7 +30,7 @@ from .cpp_numbers import (
     WIDE,
     WITHIN_WHOLE,
     converted,
-    keeping_nan,
+    form_for,
     kind_of,
     of_known,
     simpler,
@@ -319,7 +319,7 @@ class Writer:
         """The same for each number."""
         if self._any_wide_lanes(operands):
             kind = OF_LANES.get(kind, kind)
-        form = keeping_nan(name, form, kind)
+        form = form_for(name, form, kind)
         shape = np.broadcast_shapes(*(part.shape for part in operands))
         if count_of(shape) > FEW and not all(map(has_known_numbers, operands)):
             return self._each_in_loops(name, form, operands, kind, shape)

@@ -426,6 +426,29 @@ def test_what_is_no_number_or_beyond_all_whole_ones_is_as_in_jax():
             np.testing.assert_allclose(own, np.asarray(other, float), rtol=1e-15)
 
 
+def of_whole_numbers(args, instants):
+    x, y = args
+    few, many = (jnp.floor(8 * own).astype(jnp.int32) for own in (y, jnp.outer(y, jnp.ones(40)).ravel()))
+    return {
+        "sizes": [jnp.abs(few), jnp.sign(few), jnp.sum(few)],
+        "bits": [~few, ~many, ~(few > 0), few & 5, few | 9, few ^ 3],
+        "all bits": [jax.lax.reduce_and(own, (0,)) for own in (few, many)],
+        "any bits": [jax.lax.reduce_or(own, (0,)) for own in (few, many)],
+        "between": jax.lax.clamp(y[0], x, y[1]),
+    }, ()
+
+
+def test_whole_numbers_and_bounds_of_which_the_lower_is_above_the_upper_are_as_in_jax():
+    rows = 3 * np.random.default_rng(0).normal(size=(40, 5))
+    kernel, form = KernelFunction(of_whole_numbers), Form.of((rows[0, :2], rows[0, 2:]))[0]
+    with jax.enable_x64(True):
+        expected = jax.vmap(lambda row: of_whole_numbers((row[:2], row[2:]), None)[0])(jnp.asarray(rows))
+    for side_by_side in (False, True):
+        found, _ = kernel.of_many(form, rows, side_by_side=side_by_side)
+        for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_array_equal(own, other)
+
+
 @pytest.mark.filterwarnings("ignore:divide by zero")
 def test_places_outside_of_a_table_and_division_by_zero_are_as_in_jax():
     """Neither of them is anything for C++; a division would end the process."""
