@@ -76,6 +76,7 @@ BY_NUMBER = {
     "and": "{} & {}",
     "or": "{} | {}",
     "xor": "{} ^ {}",
+    "shift_right_arithmetic": "{} >> {}",
     "not": "!{}",
     "is_finite": "({0} - {0} == 0.0)",
 }

@@ -262,8 +262,12 @@ class Writer:
             which, *cases = operands
             if has_known_numbers(which) and which.size == 1:
                 return cases[int(self.entries(which).item())]
-            if len(cases) != 2:
-                raise NotImplementedError("A choice among more than two values has no C++ here; write `jnp.where`.")
+            if len(cases) > 2:
+                found = cases[0]
+                for number, case in enumerate(cases[1:], 1):
+                    here = self.each("ge", BY_NUMBER["ge"], [which, of_numbers(number)], "bool")
+                    found = self.by_number(name, params, [here, found, case], kind)
+                return found
             form = "({0} ? {2} : {1})"
         elif name == "convert_element_type" and self.lanes and self.is_wide(operands[0]):
             return self._converted_lanes(operands[0], OF_LANES[kind])
@@ -289,8 +293,6 @@ class Writer:
                 if params["rounding_method"] == jax.lax.RoundingMethod.AWAY_FROM_ZERO
                 else "wp::rint({})"
             )
-        elif name == "not" and kind != "bool":
-            form = "~{}"
         elif name in BY_NUMBER:
             form = self.form_of(name, operands)
         else:

@@ -78,7 +78,7 @@ def _steps_can_be_written() -> bool:
     structure, load = belt_oscillator(), Pulse(100.0, 1.2)
     laws = Coulomb(0.2), ExponentialDecay(0.2, 0.1, 0.5)
     forms = [Form.of((Scene(structure, law, 1.0, load), np.zeros(2 * structure.size)))[0] for law in laws]
-    return all(_can_be_written(_step, form) for form in forms)
+    return all(_failure_of_writing(_step, form) is None for form in forms)
 
 
 def _step(args, instants):
@@ -92,22 +92,28 @@ def _step(args, instants):
 def _laws_can_be_written(scene: Scene) -> bool:
     """Whether friction and load can be written as C++: of laws from elsewhere this is tried."""
     laws, count = (scene.friction, scene.load), len(scene.structure.contacts)
-    if all(type(own).__module__.partition(".")[0] == PACKAGE for own in (*laws, *getattr(scene.friction, "laws", ()))):
+    kinds = [type(own) for own in (*laws, *getattr(scene.friction, "laws", ()))]
+    if not (others := [kind for kind in kinds if kind.__module__.partition(".")[0] != PACKAGE]):
         return True
     form, _ = Form.of((*laws, np.zeros(() if count == 1 else count)))
     try:
-        return _can_be_written(_values, form)
+        failure = _failure_of_writing(_values, form)
     except TypeError:  # it has fixed fields that cannot be told apart; or it fails, as XLA's trace will say
         return False
+    if failure is not None:
+        names = " and ".join(dict.fromkeys(f"`{kind.__name__}`" for kind in others))
+        _tell_once(f"No kernel can be made of {names}", failure.rstrip("."))
+    return failure is None
 
 
 @functools.cache
-def _can_be_written(function: Callable, form: Form) -> bool:
+def _failure_of_writing(function: Callable, form: Form) -> str | None:
+    """Why a function has no C++, if it has none."""
     try:
         traced_source(function, form, ())
-    except NotImplementedError:
-        return False
-    return True
+    except NotImplementedError as failure:
+        return str(failure)
+    return None
 
 
 def _values(args, instants):

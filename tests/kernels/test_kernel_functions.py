@@ -435,6 +435,7 @@ def of_whole_numbers(args, instants):
         "all bits": [jax.lax.reduce_and(own, (0,)) for own in (few, many)],
         "any bits": [jax.lax.reduce_or(own, (0,)) for own in (few, many)],
         "between": jax.lax.clamp(y[0], x, y[1]),
+        "cases": jnp.select([y > 1, y > 0, y > -1], [y**2, jnp.sin(y), x[0] + y], 7.0),
     }, ()
 
 

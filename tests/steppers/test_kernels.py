@@ -159,12 +159,12 @@ def test_a_later_jax_has_kernels_if_they_can_be_written(paper_scene, monkeypatch
     kernel_scope._steps_can_be_written.cache_clear()
     assert kernel_scope.has_kernel(paper_scene, fj.EventExact())
     monkeypatch.delitem(cpp_arrays.MOVING, "slice")
-    for cached in (kernel_scope._steps_can_be_written, kernel_scope._can_be_written, kernel_scope._tell_once):
+    for cached in (kernel_scope._steps_can_be_written, kernel_scope._failure_of_writing, kernel_scope._tell_once):
         cached.cache_clear()
     with pytest.warns(UserWarning, match=r"JAX .* is later than this version knows.*pip install 'jax<0\.2'"):
         assert not kernel_scope.has_kernel(paper_scene, fj.EventExact())
     monkeypatch.undo()
-    for cached in (kernel_scope._steps_can_be_written, kernel_scope._can_be_written):
+    for cached in (kernel_scope._steps_can_be_written, kernel_scope._failure_of_writing):
         cached.cache_clear()
     assert kernel_scope.has_kernel(paper_scene, fj.EventExact())
 
