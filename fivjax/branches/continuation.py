@@ -110,6 +110,7 @@ def continue_cycle(
     final = under_final_load(scene)
     known = [name for name, value in final.parameters.items() if np.ndim(value) == 0]
     arguments.one_of("parameter", parameter, tuple(known))
+    parameter = str(parameter)
     low, high = _checked_bounds(bounds)
     check_corners(final, {parameter: np.array([low, high])})
     value = float(final.parameters[parameter])

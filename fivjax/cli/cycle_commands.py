@@ -79,8 +79,9 @@ class Branch:
             checked_axes(scene, {upwards[0]: upwards[1]})
         branches = {}
         labels = [""] if other is None else [f"{other} = {value}" for value in apart(*values)]
-        for value, label, path in zip(values, labels, data, strict=False):
-            here = scene if other is None else scene.replace(**{other: value})
+        # Before the first branch is computed, all are checked.
+        scenes = [scene if other is None else scene.replace(**{other: value}) for value in values]
+        for here, label, path in zip(scenes, labels, data, strict=False):
             try:
                 branches[label] = fj.continue_cycle(here, name, bounds, points=self.points)
             except fj.NoLimitCycle as none:

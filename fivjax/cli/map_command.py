@@ -69,6 +69,7 @@ class Map:
     def run(self) -> None:
         import numpy as np
 
+        from ..maps.axes import checked_axes
         from ..maps.checkpoint import jobs_beside
 
         # When the interrupted map was begun, its files were checked already.
@@ -95,6 +96,8 @@ class Map:
                 f"it by `--resume`, or delete that to begin anew."
             )
         scene, method = self.scene.scene(), self.method.stepper()
+        # The name of an option of maps would be taken for that.
+        checked_axes(scene, axes)
         # What draws is imported while kernels are compiled and run, which leaves Python to it.
         threading.Thread(target=importlib.import_module, args=("fivjax.plot",), daemon=True).start()
         try:

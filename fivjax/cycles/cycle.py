@@ -124,6 +124,8 @@ class LimitCycle(eqx.Module):
         """
         scene = Scene.from_dataset(dataset)
         try:
+            if float(dataset["t"][0]) != 0.0:
+                raise ValueError
             attrs, (start, points) = dataset.attrs, (dataset.isel(t=0), dataset["section_point"].values)
             word = zip(dataset["word_status"].values.tolist(), dataset["word_duration"].values.tolist(), strict=True)
             phases = [

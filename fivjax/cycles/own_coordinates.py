@@ -15,7 +15,9 @@ import equinox as eqx
 import numpy as np
 
 from ..foundation.precision import in_double_precision
+from ..io.datasets import about
 from ..model.contact_coordinates import from_contact_coordinates, to_contact_coordinates, transformation
+from ..model.contact_point import directions
 from ..model.description import describe
 from ..model.scene import Scene, scene_in_contact_coordinates
 from ..section.free_directions import snapped_to_section
@@ -37,15 +39,21 @@ def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         given: dict[str, Any] = dict(zip(names, args, strict=False)) | dict(kwargs)
-        scene = given.get("scene")
+        scene, own = given.get("scene"), {"start", "cycle"} & set(names) & given.keys()
+        if isinstance(scene, Scene):
+            for name in own:
+                _refuse_other_contacts(name, given[name], scene)
         if not isinstance(scene, Scene) or scene.structure.contacts_at_coordinates:
             return function(*args, **kwargs)
-        for name in {"start", "cycle"} & set(names) & given.keys():
-            given[name] = _inside(scene, given[name])
+        for name in own:
+            given[name] = _inside(scene, given[name], name)
         # Anything else is refused by the function.
         starts = given.get("starts")
-        if "starts" in names and isinstance(starts, Iterable) and not isinstance(starts, str | Mapping):
-            given["starts"] = [_inside(scene, start) for start in starts]
+        listed = (
+            isinstance(starts, Iterable) and not isinstance(starts, str | Mapping) and getattr(starts, "ndim", 1) > 0
+        )
+        if "starts" in names and listed:
+            given["starts"] = [_inside(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
         given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
         return _outside(scene, call(**given))
 
@@ -83,18 +91,32 @@ def _turned(cycle: LimitCycle, scene: Scene, turned: Callable, matrix: np.ndarra
     )
 
 
+def _refuse_other_contacts(name: str, start, scene: Scene) -> None:
+    """Refuse a cycle whose contacts lie elsewhere: its coordinates are others, too."""
+    if not isinstance(start, LimitCycle) or start.scene.structure.size != scene.structure.size:
+        return
+    one, other = (np.array(directions(own.structure.contacts, own.structure.size)) for own in (start.scene, scene))
+    # Those of neighbours may differ a little.
+    if one.shape != other.shape or np.max(np.abs(one - other)) > 0.1 * np.max(np.abs(other)):
+        raise ValueError(
+            f"Argument `{name}` must be a cycle whose contacts are the coordinates or vectors of those of `scene`: in other "
+            "coordinates its states are others. Compute one of this scene by `fivjax.limit_cycle(scene)`."
+        )
+
+
 @in_double_precision
-def _inside(scene: Scene, start):
+def _inside(scene: Scene, start, name: str):
     if isinstance(start, LimitCycle):
         return cycle_in_contact_coordinates(start)
     if start is None:
         return None
     if isinstance(start, Trajectory):
+        start.refuse_batch("A start")
         start = np.concatenate([np.asarray(start.displacement)[-1], np.asarray(start.velocity)[-1]])
     if isinstance(start, tuple | list) and len(start) == 2:
         state, status = start
-        return np.asarray(start_in_contact_coordinates(scene, state)), status
-    return np.asarray(start_in_contact_coordinates(scene, start))
+        return np.asarray(start_in_contact_coordinates(scene, state, name)), status
+    return np.asarray(start_in_contact_coordinates(scene, start, name))
 
 
 @in_double_precision
@@ -118,6 +140,7 @@ def _dataset_outside(scene: Scene, dataset):
     """A dataset with the user's scene; and with states of cycles in its coordinates."""
     if "scene" in dataset.attrs:
         dataset.attrs["scene"] = json.dumps(describe(scene))
+        dataset.attrs["about"] = about(scene, json.loads(dataset.attrs["settings"]))
     if "state" in dataset.variables and dataset["state"].dims == ("point", "coordinate"):
         names = scene.structure.coordinates
         dataset["state"] = (dataset["state"].dims, from_contact_coordinates(scene.structure, dataset["state"].values))

@@ -132,7 +132,8 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
         'periodic'
     """
     check_scene(scene)
-    if isinstance(starts, str | Mapping) or not isinstance(starts, Iterable):
+    # An array without axes is iterable by its type alone.
+    if isinstance(starts, str | Mapping) or not isinstance(starts, Iterable) or getattr(starts, "ndim", 1) == 0:
         raise TypeError(
             f"Argument `starts` must be a list of states `(2n,)` or trajectories, but is {arguments.describe(starts)}."
         )

@@ -235,7 +235,7 @@ def _checked(scene: Scene, by, free, bounds):
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p is raised")
     arguments.real_number("by", by, above=0)
     bounds = arguments.by_name("bounds", bounds, '"k1": (90e3, 110e3)')
-    names = arguments.listed_names("free", free, "k1") or tuple(bounds)
+    names = tuple(dict.fromkeys(arguments.listed_names("free", free, "k1"))) or tuple(bounds)
     if not names:
         raise ValueError('Argument `free` must name at least one parameter, such as ["k1", "c2"].')
     known = differentiable(scene)

@@ -149,7 +149,7 @@ def one_of(name: str, value, choices: Iterable[str]) -> None:
 def listed_names(name: str, value, example: str) -> tuple[str, ...]:
     """The names in a list; one name may stand for itself."""
     if isinstance(value, str):
-        return (value,)
+        return (str(value),)
     # An array without axes is iterable by its type alone.
     listed = isinstance(value, Iterable) and not isinstance(value, Mapping) and getattr(value, "ndim", 1) > 0
     names = tuple(value) if listed else ()

@@ -181,7 +181,7 @@ def in_lines() -> Iterator[None]:
 
 
 def _shown_as(shown: bool | None) -> str:
-    if shown is False:
+    if shown is not None and not shown:
         return "nothing"
     if shown or _has_room():
         return "bar"

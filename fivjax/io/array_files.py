@@ -79,8 +79,15 @@ def matrix_of(place: str, value) -> FileMatrix:
 
     **Raises:** `ValueError` for what is no matrix of numbers.
     """
+    if np.ma.is_masked(value):
+        raise ValueError(f"{place} has masked entries. Fill them, for instance by `filled(0.0)`.")
     if not sparse.issparse(value):
-        value = np.asarray(value)
+        try:
+            value = np.asarray(value)
+        except ValueError:
+            raise ValueError(
+                f"{place} must be a square matrix of numbers, but its rows are of different lengths."
+            ) from None
         if value.dtype.kind not in "biufc" or value.ndim != 2:
             raise ValueError(
                 f"{place} must be a square matrix of numbers, but has shape {value.shape} and type {value.dtype}."

@@ -5,11 +5,10 @@ xarray is imported where a dataset is made or opened, never before: `import fivj
 
 import json
 import threading
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from io import BytesIO
-from numbers import Number
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,8 +55,8 @@ def labelled(dataset: "xr.Dataset", scene: Scene, **settings) -> "xr.Dataset":
     accessor.register()
     for name in list(dataset.variables):
         label(dataset[name])
-    about = {
-        "about": f"{scene!r}; {', '.join(f'{name} {value}' for name, value in settings.items())}".rstrip("; "),
+    first = {
+        "about": about(scene, settings),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "fivjax": metadata.version("fivjax"),
         "jax": jax.__version__,
@@ -66,13 +65,19 @@ def labelled(dataset: "xr.Dataset", scene: Scene, **settings) -> "xr.Dataset":
     }
     # What only programs read comes last.
     dataset.attrs = {
-        **about,
+        **first,
         **dataset.attrs,
-        **about,
-        "settings": json.dumps(settings),
+        **first,
+        # Single numbers may be those of NumPy or JAX.
+        "settings": json.dumps(settings, default=lambda value: np.asarray(value).item()),
         "scene": json.dumps(describe(scene)),
     }
     return dataset
+
+
+def about(scene: Scene, settings: Mapping) -> str:
+    """A line about a scene and the settings with which something was computed of it."""
+    return f"{scene!r}; {', '.join(f'{name} {value}' for name, value in settings.items())}".rstrip("; ")
 
 
 def check_axis_names(axes: Iterable[str], results: Collection[str], of: str) -> None:
@@ -165,14 +170,35 @@ def open(path: str | Path) -> "xr.Dataset":
 
 
 def _check_attributes(dataset: "xr.Dataset") -> None:
-    held = str | bytes | Number | np.ndarray | np.generic | list | tuple
+    for name in dataset.variables:
+        if not isinstance(name, str):
+            raise TypeError(f"Variables of the result must have texts as names, but one is called {name!r}.")
     variables = ((f"variable `{name}`", variable.attrs) for name, variable in dataset.variables.items())
     for of, attributes in (("result", dataset.attrs), *variables):
         for name, value in attributes.items():
-            if not isinstance(value, held) or isinstance(value, bool | np.bool_):
+            if not isinstance(name, str) or not _can_be_kept(value):
                 raise TypeError(
-                    f"Attribute `{name}` of the {of} must be a text or numbers, but is {arguments.describe(value)}."
+                    f"Attribute `{name}` of the {of} must be a text or numbers, under a text as its name, but is "
+                    f"{arguments.describe(value)}."
                 )
+
+
+def _can_be_kept(value) -> bool:
+    """Whether a file holds such an attribute: a text, a number of up to 64 bits, or several of one of these."""
+    if isinstance(value, str):
+        return "\0" not in value and not any("\ud800" <= letter <= "\udfff" for letter in value)
+    if isinstance(value, np.ndarray) and value.dtype.kind not in "iuf":
+        value = value.ravel().tolist()
+    if isinstance(value, list | tuple):
+        texts = {isinstance(one, str) for one in value}
+        return (
+            len(texts) <= 1
+            and not any(isinstance(one, list | tuple) for one in value)
+            and all(map(_can_be_kept, value))
+        )
+    if isinstance(value, int) and not isinstance(value, bool):
+        return -(2**63) <= value < 2**64
+    return isinstance(value, bytes | float | np.integer | np.floating | np.ndarray)
 
 
 def netcdf_of(dataset: "xr.Dataset") -> bytes:

@@ -5,6 +5,7 @@ import stat
 from io import BytesIO
 from pathlib import Path
 
+from ..foundation import arguments
 from ..foundation.whole_files import try_to_write, write_whole
 
 
@@ -81,12 +82,18 @@ def _status(place: Path) -> os.stat_result | None:
 def save_figure(figure, path: str | Path, **options) -> Path:
     """Write a matplotlib figure; the file appears under its name only when it is whole.
 
-    **Raises:** `ValueError` for a path that cannot be written, `OSError` where the disk is full.
+    **Raises:** `TypeError` for what is no figure, `ValueError` for a path that cannot be written, `OSError` where the disk is
+    full.
 
     **Example:**
 
         >>> path = fj.save_figure(fj.plot.response(run), "squeal.png")
     """
+    if not hasattr(figure, "savefig"):
+        raise TypeError(
+            "Argument `figure` must be a matplotlib figure, such as `fj.plot.response(run)`, but is "
+            f"{arguments.describe(figure)}."
+        )
     path = check_writable(path)
     options = {"dpi": 150, "bbox_inches": "tight", "format": path.suffix.lstrip(".") or "png", **options}
     content = BytesIO()

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -27,7 +28,8 @@ class NodeContact:
     - `against`: the other node, where the contact is between two nodes of the structure; displacements are then those of
       `node` less those of `against`. Unless given, the node touches the belt.
 
-    **Raises:** `TypeError` for a node that is no whole number; `read_structure` refuses what is no direction.
+    **Raises:** `TypeError` for a node that is no whole number, `ValueError` for one against itself; `read_structure` refuses
+    what is no direction.
 
     **Example:**
 
@@ -43,6 +45,14 @@ class NodeContact:
         for name, node in (("node", self.node), ("against", self.against)):
             if not arguments.is_whole(node) and not (name == "against" and node is None):
                 raise TypeError(f"Argument `{name}` must be the number of a node, but is {arguments.describe(node)}.")
+        if self.against == self.node:
+            raise ValueError(f"Argument `against` must be another node than `node`, but both are {self.node}.")
+        for name in ("tangential", "normal"):
+            # Lists and arrays are not compared or hashed as one.
+            value = getattr(self, name)
+            parts = value.tolist() if hasattr(value, "tolist") else value
+            if isinstance(parts, list):
+                object.__setattr__(self, name, tuple(parts))
 
 
 def read_contacts(path: str | Path) -> list[NodeContact]:
@@ -167,9 +177,20 @@ def _components(direction) -> dict[int, float]:
     elif arguments.is_whole(direction):
         if 0 <= direction <= 6:
             return {int(direction): 1.0}
-    elif np.shape(direction) == (3,) and np.asarray(direction).dtype.kind in "iuf" and np.linalg.norm(direction) > 0:
-        unit = np.asarray(direction, float) / np.linalg.norm(direction)
+    elif _is_vector(direction):
+        # The largest is 1 first: squares of huge numbers are none.
+        unit = np.asarray(direction, float) / np.max(np.abs(direction))
+        unit /= np.linalg.norm(unit)
         return {axis + 1: float(share) for axis, share in enumerate(unit) if share != 0}
     raise ValueError(
-        f"A direction must be 'x', '-z' and so on, a number from 1 to 6, or three numbers, but is {direction!r}."
+        f"A direction must be 'x', '-z' and so on, a number from 1 to 6, or three numbers, not all zero, but is {direction!r}."
     )
+
+
+def _is_vector(direction) -> bool:
+    """Whether these are three finite numbers, of which one is not zero."""
+    parts = direction.tolist() if hasattr(direction, "tolist") else direction
+    if not isinstance(parts, tuple | list) or len(parts) != 3:
+        return False
+    numbers = all(isinstance(part, int | float | np.number) and not isinstance(part, bool) for part in parts)
+    return numbers and all(map(math.isfinite, parts)) and any(parts)

@@ -132,7 +132,7 @@ class Recording(eqx.Module):
         self.t = _instants(t, count)
         self.channels = tuple(by_channel)
         self.values = np.stack(list(by_channel.values()), axis=1)
-        self.regime, self.sampling, self.filter = regime, sampling, frequency_response(filter)
+        self.regime, self.sampling, self.filter = str(regime), str(sampling), frequency_response(filter)
         for name, value in (("offset", offset), ("y0", y0)):
             if value is not None and regime != "kick":
                 raise ValueError(

@@ -222,7 +222,12 @@ def _labels(labels) -> tuple[Label, ...] | None:
             raise ValueError(
                 f"File `{labels}` must hold two whole numbers a line, node and direction: {error}"
             ) from None
-    table = np.asarray(labels)
+    try:
+        table = np.asarray(labels)
+    except ValueError:
+        raise ValueError(
+            "Argument `labels` must hold two whole numbers for each row, a node and a direction."
+        ) from None
     if table.ndim != 2 or table.shape[1] != 2 or table.dtype.kind not in "iu":
         raise ValueError(
             f"Argument `labels` must hold a node and a direction, two whole numbers, for each row, but has shape "

@@ -215,7 +215,8 @@ class Histories:
             sizes, later = _later(rows, rates, step, _sum_of_sizes)
             bends, _ = _later(rows * rates[:, None] ** 2, rates, step, _sum_of_sizes)
             crude = float(np.sum(np.abs(rows) * np.abs(rates[:, None]) ** 4))
-            size = min(size, margin / max(peak, _peak(sizes, bends, crude, step)))
+            largest = max(peak, _peak(sizes, bends, crude, step))
+            size = min(size, margin / largest if largest > 0 else np.inf)
             for values, rows in ((during, vectors), (sizes, later)):
                 shapes.append(-np.sign(rows[_highest(values)]))
         shapes = np.concatenate(shapes)
@@ -245,7 +246,7 @@ def _later(rows: np.ndarray, rates: np.ndarray, step: float, norm) -> tuple[np.n
     """Responses and their norms at equally spaced instants from zero on, until later ones must be smaller than these."""
     whole = float(np.sum(norm(np.abs(rows))))
     sizes, vectors, most, count = [], [], 0.0, 0
-    while not count or np.max(np.exp(rates.real * step * count)) * whole >= most:
+    while not count or (whole > 0 and np.max(np.exp(rates.real * step * count)) * whole >= most):
         if count > MOST_INSTANTS:
             raise ValueError(
                 "Steady sliding decays too slowly here for a certified bound. Go further from the critical friction."

@@ -181,7 +181,11 @@ def smallest_kick(
     if "p" not in free:
         raise ValueError(f'Argument `over` must hold "p", whose smallest value is sought, but is {free!r}.')
     own = float(scene.load.duration)
-    given = {"p": (1.0, 5.0), "duration": (0.0, 2 * own), **bounds}
+    given = {"p": (1.0, 5.0), **({"duration": (0.0, 2 * own)} if "duration" in free and own > 0 else {}), **bounds}
+    if "duration" in free and "duration" not in given:
+        raise ValueError(
+            'Argument `bounds` must have durations for a pulse that has none itself, such as {"duration": (0.0, 0.1)}.'
+        )
     unknown = sorted(set(given) - set(OF_KICK))
     if unknown:
         raise ValueError(
@@ -324,7 +328,7 @@ def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
         kicked = (1 - np.exp(np.outer(after, rates))) * (shares * modal)
         gap = after[1] - after[0] if len(after) > 1 else 0.0
         peak = max(peak, float(np.max(_peaks(kicked, envelope))) + 0.5 * slope * gap)
-        least = min(least, margin / peak)
+        least = min(least, margin / peak if peak > 0 else np.inf)
     return float(least)
 
 

@@ -96,7 +96,8 @@ def tradeoff(
         ... )
     """
     methods = default_methods() if methods is None else methods
-    _check(scene, methods, t1, trajectories, precisions, boundary, refine)
+    _check(scene, methods, t1, trajectories, boundary, refine)
+    precisions = _checked_precisions(precisions)
     frequency = _frequency(scene)
     rows = {(name, kind): method for (name, method), kind in itertools.product(methods.items(), precisions)}
     measures = ("cost", "state_error", "p_crit_error", "wrong_verdicts", "undecided")
@@ -177,7 +178,16 @@ def table(dataset: xr.Dataset) -> str:
     return "\n".join(lines)
 
 
-def _check(scene, methods, t1, trajectories, precisions, boundary, refine) -> None:
+def _checked_precisions(precisions) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(arguments.listed_names("precisions", precisions, "float64")))
+    if not names:
+        raise ValueError("Argument `precisions` must hold at least one of 'float64' and 'float32', but is empty.")
+    for kind in names:
+        arguments.one_of("precisions", kind, ("float64", "float32"))
+    return names
+
+
+def _check(scene, methods, t1, trajectories, boundary, refine) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
     if not isinstance(methods, dict) or not methods:
         raise TypeError("Argument `methods` must be a dict of steppers by name, such as {'exact': fj.EventExact()}.")
@@ -186,10 +196,6 @@ def _check(scene, methods, t1, trajectories, precisions, boundary, refine) -> No
     arguments.real_number("t1", t1, above=0)
     arguments.whole_number("trajectories", trajectories, minimum=1)
     refuse_painleve(scene)
-    if not precisions:
-        raise ValueError("Argument `precisions` must hold at least one of 'float64' and 'float32', but is empty.")
-    for kind in precisions:
-        arguments.one_of("precisions", kind, ("float64", "float32"))
     arguments.truth("boundary", boundary)
     arguments.whole_number("refine", refine, minimum=0)
     if boundary or refine:

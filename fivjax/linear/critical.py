@@ -27,7 +27,7 @@ from .feedback import friction_loop, slope_loop
 from .gradients import by_numpy_if_small, with_own_gradient
 from .outcomes import CODES, WHY, Mechanism, StabilityOutcome
 from .several_contacts import critical_friction_of_several, first_limit_of_several
-from .system import as_scene, check_direction
+from .system import as_scene, checked_direction
 
 
 class StabilityLimit(eqx.Module):
@@ -76,7 +76,7 @@ def _checked(structure: Structure, direction) -> Structure:
 
     what = "a Structure, such as belt_oscillator()"
     arguments.instance("structure", structure, Structure, f"{what}, or `scene.structure`")
-    check_direction(direction)
+    checked_direction(direction)
     own = in_contact_coordinates(structure)
     if all(map(is_known, own.matrices)):
         free, (tangential, _) = free_in_sliding(own), contact_coordinates(own)

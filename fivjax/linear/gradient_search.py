@@ -22,7 +22,7 @@ from .gradients import in_natural_units, significant_growth
 from .linearisation import linear_sliding, time_scale
 from .outcomes import StabilityOutcome
 from .routh_hurwitz import margin
-from .system import as_scene, check_direction
+from .system import as_scene, checked_direction
 
 
 class _Bracket(eqx.Module):
@@ -131,7 +131,7 @@ def search_critical_friction(
     arguments.real_number("start", start, above=0)
     arguments.real_number("highest", highest, minimum=float(start))
     arguments.one_of("route", route, ("eigenvalues", "routh-hurwitz"))
-    check_direction(direction)
+    direction = checked_direction(direction)
     arguments.whole_number("max_steps", max_steps, minimum=1)
     if route == "routh-hurwitz" and is_known(structure.damping) and not np.any(np.asarray(structure.damping)):
         raise ValueError(

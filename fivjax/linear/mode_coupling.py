@@ -15,7 +15,7 @@ from .crossings import first_limit
 from .feedback import friction_loop
 from .gradients import by_numpy_if_small
 from .outcomes import COALESCENCE, StabilityOutcome
-from .system import check_direction
+from .system import checked_direction
 
 
 class Coalescence(eqx.Module):
@@ -89,7 +89,7 @@ def coalescence(structure: Structure, *, damped: bool = False, direction: int = 
     structure = in_contact_coordinates(structure)
     refuse_several_contacts(structure, "`coalescence`", "`growth_rate` takes several.")
     arguments.instance("damped", damped, bool, "True or False")
-    check_direction(direction)
+    direction = checked_direction(direction)
     mu, omega, damped_mu, s, found, kept = jax.tree.map(
         np.asarray, _coalescence(matrices_only(structure), jnp.asarray(float(direction)))
     )

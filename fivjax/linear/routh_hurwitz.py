@@ -24,7 +24,7 @@ from ..model.sliding import sliding_matrices
 from ..model.structure import Structure
 from .linearisation import state_matrix, time_scale
 from .polynomials import characteristic_polynomial, determinant
-from .system import check_direction
+from .system import checked_direction
 
 # Up to this number of coordinates the determinant is expanded (2ᵐ minors); larger ones are left to matrix routines.
 LARGEST_EXPANDED = 4
@@ -73,7 +73,7 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
     structure = in_contact_coordinates(structure)
     refuse_several_contacts(structure, "`margin`", "`growth_rate` takes several.")
     arguments.real_number("mu", mu, minimum=0)
-    check_direction(direction)
+    direction = checked_direction(direction)
     # The bialternate sum has N(N-1)/2 rows for N eigenvalues.
     largest_size = 32
     if structure.size > largest_size:

@@ -15,7 +15,7 @@ from ..model.structure import Structure
 from .critical import critical_friction, stability_limit
 from .gradients import by_numpy_if_small
 from .outcomes import Mechanism, StabilityOutcome
-from .system import as_scene
+from .system import as_scene, checked_direction
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -72,6 +72,7 @@ def sensitivity(structure: Structure, *, direction: int = 1) -> Sensitivity:
     import xarray as xr
 
     arguments.known("structure", structure)
+    direction = checked_direction(direction)
     limit = stability_limit(structure, direction=direction)
     if limit.outcome is not StabilityOutcome.FOUND:
         raise ValueError(

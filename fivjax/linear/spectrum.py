@@ -17,7 +17,7 @@ from ..model.scene import Scene, sliding_equilibrium
 from ..model.structure import Structure
 from .gradients import with_own_gradient
 from .linearisation import sliding_matrix, sliding_motion
-from .system import as_scene, check_direction
+from .system import as_scene, checked_direction
 
 # Points whose matrices are in memory together.
 POINTS_AT_ONCE = 256
@@ -73,7 +73,7 @@ def eigenvalues(system: Structure | Scene, mu=None, *, direction: int = 1) -> Co
     """
     if mu is not None and np.ndim(mu) > 0:
         arguments.instance("system", system, Structure, "a Structure where `mu` is an array")
-        check_direction(direction)
+        direction = checked_direction(direction)
         _check_frictions(mu)
         mu = real(mu)
         return _eigenvalues_over(system, mu.ravel(), direction).reshape(*mu.shape, -1)

@@ -10,10 +10,11 @@ from ..model.scene import Scene, check_corners, scene_in_contact_coordinates
 from ..model.structure import Structure
 
 
-def check_direction(direction) -> None:
-    """Refuse any direction of the belt but +1 and -1."""
+def checked_direction(direction) -> int:
+    """The direction of the belt, which is +1 or -1."""
     if np.ndim(direction) or direction not in (1, -1):
         raise ValueError(f"Argument `direction` must be 1 or -1, but is {direction!r}.")
+    return int(direction)
 
 
 def as_scene(system: Structure | Scene, mu, direction: int) -> Scene:
@@ -22,7 +23,7 @@ def as_scene(system: Structure | Scene, mu, direction: int) -> Scene:
     A structure gets no load: its linear motion with constant friction is the same under any load.
     """
     arguments.instance("system", system, (Structure, Scene), "a Structure or a Scene")
-    check_direction(direction)
+    direction = checked_direction(direction)
     if isinstance(system, Structure):
         if mu is None:
             raise ValueError("Argument `mu` must be given with a structure; a scene carries its own friction.")
@@ -56,6 +57,8 @@ def with_axes(
     else:
         scene = as_scene(system, None, direction)
         known = sorted(scene.parameters)
+    # Names of an array are NumPy's own, which JAX takes for arrays.
+    parameters = {str(name): value for name, value in parameters.items()}
     unknown = [name for name in parameters if name not in known]
     if unknown:
         near = arguments.did_you_mean(unknown[0], known)

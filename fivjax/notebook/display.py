@@ -91,11 +91,11 @@ def _refuse_more_axes(dataset: "xr.Dataset") -> None:
             )
 
 
-def _of_trajectory(run: Trajectory, of_phase_plane: float = 0.25, **options) -> Figure:
+def _of_trajectory(run: Trajectory, of_phase_plane: float = 0.25, figure: Figure | None = None, **options) -> Figure:
     """Its response, and the last share of it in the phase plane."""
     if len(run.scene.structure.contacts) > 1:
-        return plot.response(run, **options)
-    figure = Figure(figsize=(10.0, 3.4), layout="constrained")
+        return plot.response(run, **options, figure=figure)
+    figure = Figure(figsize=(10.0, 3.4), layout="constrained") if figure is None else figure
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(5, 3)), object)
     # A subfigure has all methods that these functions need.
     plot.response(run, **options, figure=left)  # pyright: ignore[reportArgumentType]

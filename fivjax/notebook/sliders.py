@@ -40,7 +40,7 @@ def slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     # The range of a structure's parameters, relative to their values.
     shares = (0.5, 1.5)
     usual = RANGES.get(_kind(name)) or tuple(share * abs(value) for share in shares)
-    low, high = ranges.get(name) or (usual if value >= 0 else (-usual[1], -usual[0]))
+    low, high = ranges[name] if name in ranges else (usual if value >= 0 else (-usual[1], -usual[0]))
     reached = [value, *([axes[name][0], axes[name][-1]] if name in axes else [])]
     low, high = float(min(low, *reached)), float(max(high, *reached))
     if low == high:

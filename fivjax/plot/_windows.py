@@ -1,6 +1,6 @@
 """Time windows of runs, their ledgers and legends, for the pictures of energy."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,16 +25,25 @@ def shade(axes: Axes, run: Trajectory, part: slice) -> dict:
 
 def windows_of(windows) -> list[Window]:
     """The windows of a list, or of an array; a single pair is one."""
-    single = np.shape(windows) == (2,)
-    listed = np.reshape(np.asarray([windows] if single else windows, float), (-1, 2)).tolist()
-    if not listed:
+    windows = list(windows) if isinstance(windows, Iterator) else windows
+    try:
+        pairs = np.asarray(windows, float)
+    except (TypeError, ValueError):
+        pairs = np.zeros(1)
+    if not pairs.size:
         raise ValueError("Argument `windows` must be a list of windows, such as [(0.1, 0.2)], but is empty.")
-    return [(start, end) for start, end in listed]
+    if pairs.ndim > 2 or pairs.shape[-1] != 2 or not np.all(pairs[..., 0] < pairs[..., 1]):
+        raise ValueError(
+            "Argument `windows` must be a list of windows, each a start and a later end, such as [(0.1, 0.2)], but is "
+            f"{windows!r}."
+        )
+    return [(start, end) for start, end in pairs.reshape(-1, 2).tolist()]
 
 
 def inside(run: Trajectory, window: Window) -> slice:
     """The rows of a run in a window; refused if there are fewer than two."""
     check_run(run)
+    (window,) = windows_of(window)
     start, end = np.searchsorted(run.t, window[0]), np.searchsorted(run.t, window[1], side="right")
     if end - start < 2:
         first, last, begin, stop = apart(*window, run.t[0], run.t[-1])

@@ -149,7 +149,8 @@ def per_cycle(cycles: xr.Dataset, *, figure: Figure | None = None) -> Figure:
         ("stick_time", "sticking", ORANGE, "-"),
         ("detach_time", "detached", BLUE, "--"),
     ):
-        times = 1e3 * cycles[name].values.reshape(len(start), -1)
+        times = cycles[name].values
+        times = 1e3 * times.reshape(len(start), int(np.prod(times.shape[1:])))
         for contact, own in enumerate(times.T):
             named = label if times.shape[1] == 1 else f"{label}, contact {contact}"
             lower.plot(start, own, color=colour, ls=style, lw=2.4 / (2 + contact), label=named)

@@ -143,7 +143,7 @@ def derivatives(
             f"Argument `functional` must be a function of a Trajectory, but is {arguments.describe(functional)}."
         )
     if isinstance(wrt, str):
-        raise TypeError(f'Argument `wrt` must be a list of names, such as ["{wrt}"], but is {wrt!r} (str).')
+        raise TypeError(f'Argument `wrt` must be a list of names, such as ["{wrt}"], but is {str(wrt)!r} (str).')
     names = arguments.listed_names("wrt", wrt, "mu")
     arguments.names_of_parameters("wrt", names, scene.parameters)
     arguments.one_of("mode", mode, ("forward", "reverse"))

@@ -61,33 +61,33 @@ def at_equilibrium(scene: Scene) -> tuple[State, Bool[Array, ""]]:
     return jnp.concatenate([q, jnp.zeros_like(q)]), exists
 
 
-def checked_start(n: int, y0) -> State:
+def checked_start(n: int, y0, name: str = "y0") -> State:
     """Displacements and velocities, given as a pair or as one array, with their shapes checked."""
     is_pair = isinstance(y0, tuple | list) and len(y0) == 2
     parts = tuple(y0) if is_pair else (y0,)
     for part in parts:
         if is_known(part):
-            arguments.numeric_array("y0", part)
+            arguments.numeric_array(name, part)
     parts = tuple(map(real, parts))
     shapes = tuple(part.shape for part in parts)
     if shapes != (((n,), (n,)) if is_pair else ((2 * n,),)):
         raise ValueError(
-            f"Argument `y0` must hold {n} displacements and {n} velocities, as a pair of arrays or one of shape "
+            f"Argument `{name}` must hold {n} displacements and {n} velocities, as a pair of arrays or one of shape "
             f"({2 * n},), but has shape {' and '.join(map(str, shapes))}."
         )
     y = jnp.concatenate(parts)
     if is_known(y) and not np.all(np.isfinite(y)):
-        raise ValueError("Argument `y0` must be finite.")
+        raise ValueError(f"Argument `{name}` must be finite.")
     if is_known(y) and np.any(np.abs(y) > arguments.LARGEST):
         raise ValueError(
-            f"Argument `y0` must be at most {arguments.LARGEST:g} in size, because products of it are computed."
+            f"Argument `{name}` must be at most {arguments.LARGEST:g} in size, because products of it are computed."
         )
     return y
 
 
-def start_in_contact_coordinates(scene: Scene, y0) -> State:
+def start_in_contact_coordinates(scene: Scene, y0, name: str = "y0") -> State:
     """A given start, checked, with the directions of all contacts as coordinates."""
-    y, structure = checked_start(scene.structure.size, y0), scene.structure
+    y, structure = checked_start(scene.structure.size, y0, name), scene.structure
     if structure.contacts_at_coordinates:
         return y
     return snapped_to_belt(scene_in_contact_coordinates(scene), jnp.asarray(to_contact_coordinates(structure, y)))

@@ -56,6 +56,17 @@ def test_a_saved_cycle_comes_back_to_the_last_bit(cycle, saddle, tmp_path):
     np.testing.assert_allclose(run.velocity[-1], run.velocity[0], atol=1e-10 * np.abs(run.velocity).max())
     with pytest.raises(ValueError, match="must be a saved limit cycle"):
         fj.LimitCycle.from_dataset(run.to_dataset())
+    with pytest.raises(ValueError, match="must be a saved limit cycle"):
+        fj.LimitCycle.from_dataset(cycle.to_dataset().isel(t=slice(3, None)))
+
+
+def test_a_cycle_in_other_coordinates_is_no_start(cycle):
+    """Its states are others there: another cycle was found."""
+    turned = fj.Scene(in_general_coordinates(cycle.scene.structure), fj.Coulomb(0.227), 1.0, fj.ConstantLoad(100.0))
+    with pytest.raises(ValueError, match="`start` must be a cycle whose contacts are"):
+        fj.limit_cycle(turned, start=cycle)
+    with pytest.raises(ValueError, match="`cycle` must be a cycle whose contacts are"):
+        fj.saddle_cycle(turned, cycle)
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 import fivjax as fj
 from fivjax.foundation import whole_files
 from fivjax.io import files
+from fivjax.io.datasets import labelled
 from fivjax.model import own_structures
 from fivjax.model.friction import AbstractFriction
 from fivjax.model.scene import IMPACT_LAWS
@@ -263,7 +264,7 @@ def test_a_scene_prints_its_values(run):
     assert same(rebuilt, run.scene)
 
 
-@pytest.mark.parametrize("value", [None, True, {"a": 1}])
+@pytest.mark.parametrize("value", [None, True, {"a": 1}, [1, "b"], [True], 10**30, "a\0b"])
 def test_what_no_file_holds_is_refused_by_name(tmp_path, value):
     """Rejects what ended in an error of h5py's that names no attribute."""
     data = xr.Dataset({"v": ("x", np.ones(2), {"own": value})})
@@ -298,3 +299,9 @@ def test_a_structure_comes_back_as_what_it_was_whatever_made_it():
     again = fj.Scene.from_dataset(fj.simulate(scene, 0.01, 1e-3).to_dataset())
     np.testing.assert_array_equal(again.structure.stiffness, scene.structure.stiffness)
     assert again.structure.coordinates == scene.structure.coordinates
+
+
+def test_settings_may_be_single_numbers_of_numpy_and_jax(run):
+    """They were refused as soon as all was computed."""
+    found = labelled(xr.Dataset(), run.scene, t_max=np.float32(3), count=np.int64(2), step=jnp.asarray(0.5))
+    assert json.loads(found.attrs["settings"]) == {"t_max": 3.0, "count": 2, "step": 0.5}

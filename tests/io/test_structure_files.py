@@ -7,6 +7,7 @@ import pytest
 from scipy import sparse
 
 import fivjax as fj
+from fivjax.io import node_contacts
 from fivjax.linear import mode_search
 from fivjax.model import structure_checks
 
@@ -517,6 +518,7 @@ REFUSED = {
     "no units": ({"units": None}, r"Argument `units` must be one of 'SI', 'mm-t-s'"),
     "a node that is not there": ({"contacts": [fj.NodeContact(9, "x", "y")]}, r"Node 9 is not in the matrices"),
     "a direction that is not there": ({"contacts": [fj.NodeContact(4, "x", "z")]}, r"Node 4 has no direction 3"),
+    "an infinite direction": ({"contacts": [fj.NodeContact(4, (np.inf, 0, 0), "y")]}, r"A direction must be 'x'"),
     "no direction": ({"contacts": [fj.NodeContact(4, "x", "up")]}, r"A direction must be 'x'"),
     "directions that are not at right angles": ({"contacts": [fj.NodeContact(4, "x", (1, 1, 0))]}, r"at right angles"),
     "a pair instead of a contact": ({"contacts": [(4, "x")]}, r"`contacts\[0\]` must be an fj.NodeContact"),
@@ -591,3 +593,15 @@ def test_matrices_in_memory_are_read_like_their_files(kind):
 def test_matrices_in_memory_that_cannot_be_used_are_refused(matrices, more, sentence):
     with pytest.raises(ValueError, match=sentence):
         fj.read_structure(matrices, units="SI", **more)
+
+
+def test_a_direction_of_huge_numbers_is_a_direction():
+    """Their squares are infinite, and the direction came out as zero."""
+    assert node_contacts._components((3e200, 0.0, -4e200)) == pytest.approx({1: 0.6, 3: -0.8})
+    assert fj.NodeContact(4, [1, 0, 0], "y") == fj.NodeContact(4, np.array([1, 0, 0]), "y")
+
+
+def test_masked_entries_are_refused():
+    masked = np.ma.array(np.eye(2), mask=[[0, 0], [0, 1]])
+    with pytest.raises(ValueError, match="masked entries"):
+        fj.read_structure({"stiffness": masked, "mass": np.eye(2)}, units="SI", labels=[(1, 1), (1, 2)], contacts=[])

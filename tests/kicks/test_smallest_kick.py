@@ -184,6 +184,14 @@ def test_states_and_histories_are_refused_what_they_do_not_have():
         fj.smallest_kick(SCENE, over="history", bounds={"p": (1.0, 2.0)})
 
 
+def test_where_no_load_moves_the_slip_a_history_has_a_bound():
+    """That slip ends is no matter then; it was said to decay too slowly."""
+    scene = fj.Scene(fj.belt_oscillator(theta=0.0), fj.Coulomb(0.0), 1.0, fj.Pulse(100.0, 1.2))
+    with jax.enable_x64(True):
+        certificate = Histories(scene, 4, 0.05).certificate()
+    assert 0 < certificate.size < 1 and np.all(np.isfinite(certificate.shapes))
+
+
 def test_histories_too_short_to_squeal_are_told_by_the_certificate():
     with pytest.raises(fj.NoSquealingKick, match="beyond 1 the load would have to pull") as none:
         fj.smallest_kick(SCENE, over="history", bounds={"duration": (0.0, 1e-5)})

@@ -83,6 +83,23 @@ def test_eigenvalues_over_an_array_of_friction():
     np.testing.assert_allclose(found[1, 1], cea.eigenvalues(belt(), 0.4), rtol=1e-13)
 
 
+@pytest.mark.parametrize("kind", [np.int64, np.float32, np.array, jnp.asarray])
+def test_the_direction_may_be_any_number_of_one(kind):
+    """As NumPy's sign has it; some functions failed inside JAX."""
+    backwards = kind(-1)
+    np.testing.assert_array_equal(
+        cea.eigenvalues(belt(), [0.1, 0.2], direction=backwards), cea.eigenvalues(belt(), [0.1, 0.2], direction=-1)
+    )
+    assert cea.sensitivity(belt(), direction=kind(1)).mu_crit == cea.sensitivity(belt()).mu_crit
+
+
+def test_axes_may_have_names_of_an_array():
+    (name,) = np.array(["mu"])
+    np.testing.assert_array_equal(
+        cea.modes(belt(), **{name: [0.1, 0.2]}).frequency, cea.modes(belt(), mu=[0.1, 0.2]).frequency
+    )
+
+
 def test_linearisation_with_falling_friction():
     speed, law = 0.5, fj.ExponentialDecay(mu_static=0.2, mu_dynamic=0.1, decay=0.5)
     scene = fj.Scene(belt(), law, belt_speed=speed, load=fj.ConstantLoad(100.0))

@@ -57,6 +57,8 @@ def test_a_dataset_offers_its_picture_and_its_scene(a_map, scene):
 def test_show_draws_what_has_a_picture(run, tmp_path):
     """Trajectories, also saved ones, have a picture; what fivjax did not make is refused."""
     assert isinstance(fj.show(run), Figure)
+    own = Figure()
+    assert fj.show(run, figure=own) is own and len(own.axes) == 2
     fj.save(run, tmp_path / "run.nc")
     assert isinstance(fj.show(fj.open(tmp_path / "run.nc")), Figure)
     with refused(TypeError, "can draw"):

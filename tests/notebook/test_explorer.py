@@ -86,6 +86,11 @@ def test_sliders_of_negative_values_reach_beyond_them():
         assert made.min == pytest.approx(reached[0], rel=0.02) and made.max == pytest.approx(reached[1])
 
 
+def test_a_range_may_be_an_array():
+    made = sliders.slider(pytest.importorskip("ipywidgets"), "mu", 0.2, {"mu": np.array([0.1, 0.4])}, {})
+    assert made.min == pytest.approx(0.1) and made.max == pytest.approx(0.4)
+
+
 def test_what_is_said_is_of_the_scene_shown(explorer, scene):
     """The critical friction beside the sliders is that of the structure they describe."""
     explorer.sliders["k1"].value = 97e3

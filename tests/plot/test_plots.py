@@ -334,6 +334,10 @@ def test_one_window_needs_no_list():
     assert windows_of(np.array(two)) == windows_of(two) == two
     with pytest.raises(ValueError, match="must be a list of windows"):
         windows_of([])
+    assert windows_of(iter(two)) == two
+    for wrong in ((0.2, 0.1), (0.1, np.nan), [0.1, 0.2, 0.3], [(0.1, 0.2), (0.3,)]):
+        with pytest.raises(ValueError, match="each a start and a later end"):
+            windows_of(wrong)
 
 
 def test_a_stacked_map_is_drawn_unstacked():
