@@ -43,7 +43,7 @@ class BranchPoint(NamedTuple):
 
 def branch_point(family: Family, curve: Curve, cycle: ComputedCycle, special: Special | None = None) -> BranchPoint:
     """A point of the branch from a computed cycle, with the real motion that starts on it."""
-    real = real_motion(family.at(cycle.parameter), cycle.phases)
+    real = motion_on(family, cycle)
     return BranchPoint(curve, cycle, real, multipliers_of(cycle.images), special)
 
 
@@ -73,6 +73,8 @@ def cycle_beyond(family: Family, last: BranchPoint, at: float, sense: float) -> 
         return None
     for share in BEYOND:
         parameter = at + sense * share * family.scale
+        if not family.is_possible(parameter):
+            return None
         closed = close_near(ReturnMaps.of(family.at(parameter)), start, crossings)
         found = None if closed is None else point_through(family, parameter, closed.point, closed.period)
         # Period and size may change as the parameter does, relative to itself, and somewhat more: not with its bounds.
@@ -90,7 +92,14 @@ def _are_alike(one: BranchPoint, other: BranchPoint, share: float) -> bool:
 
 def is_real_motion(family: Family, cycle: ComputedCycle) -> bool:
     """Whether the real motion has the modes and events of a computed cycle."""
-    return _moves_as_computed(real_motion(family.at(cycle.parameter), cycle.phases), cycle)
+    return _moves_as_computed(motion_on(family, cycle), cycle)
+
+
+def motion_on(family: Family, cycle: ComputedCycle) -> RealMotion | None:
+    """The real motion that starts on a computed cycle; None where it does not last, or no scene has the cycle's parameter."""
+    if not family.is_possible(cycle.parameter):
+        return None
+    return real_motion(family.at(cycle.parameter), cycle.phases)
 
 
 def _moves_as_computed(real: RealMotion | None, cycle: ComputedCycle) -> bool:

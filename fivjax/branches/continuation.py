@@ -133,7 +133,7 @@ def continue_cycle(
             f"The motion to start from, at {parameter} = {value:g}, is a torus, which is not continued. Start where the limit "
             f"cycle is periodic, or give a `LimitCycle` as `start`."
         )
-    family = Family(final, direction_of(final, parameter), parameter, value, high - low)
+    family = Family(final, direction_of(final, parameter), parameter, value, (low, high))
     first = point_through(family, value, point_of(cycle), cycle.period)
     if first is None:
         raise NoLimitCycle(

@@ -64,13 +64,33 @@ class _Front:
         if ahead is None:
             return self._around_corner()
         following, turned, self.step = ahead
+        if not self.family.is_possible(following.parameter):
+            return self._up_to_bound(following)
         last = branch_point(self.family, self.here.curve, following)
         return self._come_to(last, turned) if last.is_real else self._through_change_of_modes()
+
+    def _up_to_bound(self, beyond: ComputedCycle) -> HalfBranch | None:
+        """To the bound of the parameter before what is `beyond` it, where there are no scenes."""
+        here, bound = self.here.cycle, self._bound_before(beyond)
+        if here.parameter == bound:
+            return self._to_bound(self.tangent, beyond)
+        share = (bound - here.parameter) / (beyond.parameter - here.parameter)
+        at = self.here.curve.at_parameter(here.u + share * (beyond.u - here.u), bound)
+        last = None if at is None else branch_point(self.family, self.here.curve, at)
+        if last is not None and last.is_real:
+            return self._come_to(last, self.here.curve.tangent(last.cycle, self.tangent))
+        if self.step <= 100 * SHORTEST:
+            return self.ended(self.here, "the contact modes change in a way that is not understood")
+        self.step *= 0.25
+        return None
+
+    def _bound_before(self, beyond: ComputedCycle) -> float:
+        return self.bounds[0] if beyond.parameter < self.bounds[0] else self.bounds[1]
 
     def _around_corner(self) -> HalfBranch | None:
         beyond = around_corner(self.family, self.here, self.tangent)
         if beyond is None:
-            return self.ended(self.here, "no cycle is found further on, however short the step")
+            return self._over_a_gap(self.here, "no cycle is found further on, however short the step")
         curve, (corner, onward) = self.here.curve, beyond
         if corner is not None and self._within(corner.cycle):
             self.points.append(branch_point(self.family, curve, corner.cycle, corner))
@@ -153,10 +173,10 @@ class _Front:
         `along`: with the cycle at the bound, if it is found.
         """
         family, here = self.family, self.here
-        bound = self.bounds[0] if beyond.parameter < self.bounds[0] else self.bounds[1]
+        bound = self._bound_before(beyond)
         reached = f"The bound {family.name} = {bound:.10g} is reached."
-        if not self.points and here.cycle.parameter == bound:
-            return HalfBranch([], reached)
+        if here.cycle.parameter == bound:
+            return HalfBranch(self.points, reached)
         share = (bound - here.cycle.parameter) / (along[-1] * family.scale)
         at = here.curve.at_parameter(here.cycle.u + share * along, bound)
         last = [] if at is None else [branch_point(family, here.curve, at)]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .branch_points import BranchPoint, branch_point, is_real_motion, risen_to_zero
+from .branch_points import BranchPoint, branch_point, is_real_motion, motion_on, risen_to_zero
 from .grazing import touch
 from .multiple_shooting import AT_SECTION, Phases, images_of_phases
 from .pseudo_arclength import ComputedCycle, Curve, Family
@@ -117,7 +117,7 @@ def _inserted(bracket: _Bracket, ahead: ComputedCycle):
         cycle = curve.along(ahead, tangent, share * step)
         if cycle is None:
             continue
-        real = real_motion(family.at(cycle.parameter), cycle.phases)
+        real = motion_on(family, cycle)
         if real is None or real.phases is None or not len(curve.modes) < len(real.phases.modes) <= MOST_PHASES:
             continue
         change = change_between(real.phases.modes, curve.modes)

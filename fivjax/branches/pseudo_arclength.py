@@ -24,11 +24,26 @@ class Family(NamedTuple):
     direction: Scene  # the derivative of the scene in the parameter
     name: str
     value: float  # of the parameter in `scene`
-    scale: float  # a large change of the parameter
+    bounds: tuple[float, float]  # of the parameter, which scenes can have
+
+    @property
+    def scale(self) -> float:
+        """A large change of the parameter."""
+        return self.bounds[1] - self.bounds[0]
 
     def at(self, parameter: float) -> Scene:
         """The scene with this value of the parameter."""
         return moved_along(self.scene, self.direction, parameter - self.value)
+
+    def is_possible(self, parameter: float) -> bool:
+        """Whether there is a scene with this value: a step may come to one beyond the bounds that no scene has."""
+        if self.bounds[0] <= parameter <= self.bounds[1]:
+            return True
+        try:
+            self.scene.replace(**{self.name: parameter})
+        except ValueError:
+            return False
+        return True
 
 
 class ComputedCycle(NamedTuple):
