@@ -657,3 +657,45 @@ def test_cycles_of_many_crossings_are_given_back(monkeypatch):
     monkeypatch.setattr(verification.Section, "of", lambda *points: None)
     assert verification.crossings_of(Turning(), SimpleNamespace(y=np.array([1.0, 0.0]))) == 27
     assert seen == [8, 512]
+
+
+@pytest.mark.parametrize("lowest", [0.2, 0.2001])
+def test_a_branch_is_not_followed_to_scenes_that_there_are_not(lowest):
+    """Below the kinetic coefficient sticking would end as soon as it begins, over and over: a step there took for ever."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2, 0.26), 0.5, fj.ConstantLoad(100.0))
+    branch = fj.continue_cycle(scene, "mu_static", (lowest, 0.27), points=20)
+    assert branch.begins == f"The bound mu_static = {lowest} is reached."
+    assert branch["parameter"].values[0] == lowest and np.all(branch["parameter"].values >= lowest)
+
+
+class Hyperbola(fj.AbstractFriction):
+    """Falls as 1/(1 + v/v_0)."""
+
+    mu_static: float
+    mu_dynamic: float
+    v_0: float
+
+    def __call__(self, slip_speed):
+        return self.mu_dynamic + (self.mu_static - self.mu_dynamic) / (1 + slip_speed / self.v_0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bounds", [(0.1142, 0.6281), (0.2, 0.32)])
+def test_a_branch_passes_a_grazing_whatever_its_bounds(bounds):
+    """The lengths of steps depend on them; with the first ones, no step led to the grazing."""
+    stiffness = [
+        [1701.4389, 587.10533, 108.50259],
+        [587.10533, 4333.81837, 2199.37771],
+        [108.50259, 2199.37771, 4140.71253],
+    ]
+    damping = [
+        [0.22861764, 0.0742636, 0.02637372],
+        [0.0742636, 0.5596059, 0.27820172],
+        [0.02637372, 0.27820172, 0.53418751],
+    ]
+    mass, load = np.diag([1.24412353, 0.50141473, 1.01339185]), [0.05720845, -1.0, -0.42755715]
+    structure = fj.Structure(mass, damping, stiffness, load, tangential=0, normal=1)
+    scene = fj.Scene(structure, Hyperbola(0.59809785, 0.3417702, 0.52763841), 0.285514, fj.ConstantLoad(2.0))
+    branch = fj.continue_cycle(scene, "belt_speed", bounds, points=35)
+    assert "grazing of N: impact inserted" in branch["special"].values
+    assert branch["parameter"].values.min() < 0.265 and branch["stable"].values[0]
