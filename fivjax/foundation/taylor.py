@@ -79,6 +79,8 @@ def _applied(equation, operands: list, length: int) -> list:
     if not real or not any(isinstance(part, Series) for part in operands):
         found = primitive.bind(*map(_value, operands), **params)
         return list(found) if primitive.multiple_results else [found]
+    if any(jnp.issubdtype(variable.aval.dtype, jnp.complexfloating) for variable in equation.outvars):
+        raise NotImplementedError("Complex numbers have no Taylor series here. Write the function without them.")
     if name in LINEAR:
         return _linear(primitive, params, operands, LINEAR[name], length)
     if name == "pow" and not isinstance(operands[1], Series):
@@ -117,6 +119,9 @@ def _linear(primitive, params, operands: list, values: Sequence[int], length: in
     terms = {place: _terms(operands[place], length) for place in places}
     rows = []
     for k in range(length):
+        if k == 1 and params.get("fill_value") is not None:
+            # What is outside of a table does not change.
+            params = {**params, "fill_value": 0}
         parts = [terms[i][k] if i in terms else _value(part) for i, part in enumerate(operands)]
         found = primitive.bind(*parts, **params)
         rows.append(found if primitive.multiple_results else [found])
@@ -243,7 +248,7 @@ def _flat(values: Array, u: Sequence[Array]) -> list[Array]:
 LINEAR: dict[str, tuple[int, ...]] = dict.fromkeys([
     "add", "add_any", "sub", "neg", "copy", "copy_p", "reshape", "broadcast_in_dim", "squeeze", "expand_dims", "slice",
     "transpose", "rev", "reduce_sum", "cumsum", "convert_element_type", "reduce_precision", "concatenate", "stack", "unstack",
-    "split", "pad", "real", "optimization_barrier", "device_put",
+    "split", "pad", "real", "optimization_barrier", "device_put", "stop_gradient",
 ], ())
 # fmt: on
 LINEAR |= {

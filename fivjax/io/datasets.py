@@ -120,14 +120,13 @@ def save(result, path: str | Path) -> Path:
             f"formats are written by xarray: `fj.open(…).to_zarr(…)`, or for some variables "
             f"`fj.open(…)[['verdict', 'amplitude']].to_dataframe().to_csv(…)`."
         )
-    _check_attributes(dataset)
     stacked = [str(name) for name, index in dataset.indexes.items() if index.nlevels > 1]
     if stacked:
         raise ValueError(
             f"Argument `result` is stacked along `{stacked[0]}`, which no file holds: save `result.unstack()`."
         )
     # Made in memory first: on a full disk HDF5 crashes the whole process.
-    return replace_whole(path, netcdf_of(dataset))
+    return replace_whole(path, netcdf_of(_with_kept_attributes(dataset)))
 
 
 def open(path: str | Path) -> "xr.Dataset":
@@ -169,36 +168,56 @@ def open(path: str | Path) -> "xr.Dataset":
         raise unreadable(path, "NetCDF", f"{error or type(error).__name__}") from None
 
 
-def _check_attributes(dataset: "xr.Dataset") -> None:
-    for name in dataset.variables:
+def _with_kept_attributes(dataset: "xr.Dataset") -> "xr.Dataset":
+    """The dataset with its attributes as a file holds them."""
+    for name in {*dataset.variables, *dataset.dims}:
         if not isinstance(name, str):
-            raise TypeError(f"Variables of the result must have texts as names, but one is called {name!r}.")
-    variables = ((f"variable `{name}`", variable.attrs) for name, variable in dataset.variables.items())
-    for of, attributes in (("result", dataset.attrs), *variables):
-        for name, value in attributes.items():
-            if not isinstance(name, str) or not _can_be_kept(value):
+            raise TypeError(
+                f"Variables and dimensions of the result must have texts as names, but one is called {name!r}."
+            )
+    kept = dataset.copy()
+    for of, part in (("result", kept), *((f"variable `{name}`", kept.variables[name]) for name in kept.variables)):
+        for name, value in part.attrs.items():
+            if not isinstance(name, str):
+                raise TypeError(f"Attributes of the {of} must have texts as names, but one is called {name!r}.")
+            try:
+                part.attrs[name] = _kept_form(value)
+            except (TypeError, ValueError):
                 raise TypeError(
-                    f"Attribute `{name}` of the {of} must be a text or numbers, under a text as its name, but is "
-                    f"{arguments.describe(value)}."
-                )
+                    f"Attribute `{name}` of the {of} must be a text, or numbers of up to 64 bits, or several of one of these, "
+                    f"but is {arguments.describe(value)}."
+                ) from None
+    return kept
 
 
-def _can_be_kept(value) -> bool:
-    """Whether a file holds such an attribute: a text, a number of up to 64 bits, or several of one of these."""
+def _kept_form(value):
+    """An attribute as a file holds it.
+
+    **Raises:** `TypeError` or `ValueError` for what no file holds.
+    """
     if isinstance(value, str):
-        return "\0" not in value and not any("\ud800" <= letter <= "\udfff" for letter in value)
-    if isinstance(value, np.ndarray) and value.dtype.kind not in "iuf":
-        value = value.ravel().tolist()
-    if isinstance(value, list | tuple):
-        texts = {isinstance(one, str) for one in value}
-        return (
-            len(texts) <= 1
-            and not any(isinstance(one, list | tuple) for one in value)
-            and all(map(_can_be_kept, value))
-        )
-    if isinstance(value, int) and not isinstance(value, bool):
-        return -(2**63) <= value < 2**64
-    return isinstance(value, bytes | float | np.integer | np.floating | np.ndarray)
+        text = str.__str__(value)
+        if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
+            raise ValueError
+        return text
+    if isinstance(value, bytes):
+        if b"\0" in value:
+            raise ValueError
+        return value
+    if isinstance(value, list | tuple | range) or hasattr(value, "dtype"):
+        array = np.asarray(value)
+        if array.dtype.kind in "iufc":
+            return value if isinstance(value, np.generic) else array
+        texts = value if isinstance(value, list | tuple) else array.ravel().tolist()
+        if array.ndim > 1 or not array.size or not all(isinstance(text, str) for text in texts):
+            raise TypeError
+        texts = list(map(_kept_form, texts))
+        return texts if array.ndim else texts[0]
+    if isinstance(value, bool) or not isinstance(value, int | float | complex):
+        raise TypeError
+    if isinstance(value, int) and not -(2**63) <= value < 2**64:
+        raise ValueError
+    return value
 
 
 def netcdf_of(dataset: "xr.Dataset") -> bytes:

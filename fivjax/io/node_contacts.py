@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -177,20 +176,24 @@ def _components(direction) -> dict[int, float]:
     elif arguments.is_whole(direction):
         if 0 <= direction <= 6:
             return {int(direction): 1.0}
-    elif _is_vector(direction):
-        # The largest is 1 first: squares of huge numbers are none.
-        unit = np.asarray(direction, float) / np.max(np.abs(direction))
-        unit /= np.linalg.norm(unit)
+    elif (unit := _vector(direction)) is not None:
         return {axis + 1: float(share) for axis, share in enumerate(unit) if share != 0}
     raise ValueError(
         f"A direction must be 'x', '-z' and so on, a number from 1 to 6, or three numbers, not all zero, but is {direction!r}."
     )
 
 
-def _is_vector(direction) -> bool:
-    """Whether these are three finite numbers, of which one is not zero."""
-    parts = direction.tolist() if hasattr(direction, "tolist") else direction
-    if not isinstance(parts, tuple | list) or len(parts) != 3:
-        return False
-    numbers = all(isinstance(part, int | float | np.number) and not isinstance(part, bool) for part in parts)
-    return numbers and all(map(math.isfinite, parts)) and any(parts)
+def _vector(direction) -> np.ndarray | None:
+    """The unit vector along three finite numbers, of which one is not zero; None for anything else."""
+    try:
+        numbers = np.asarray(direction)
+    except ValueError:
+        return None
+    if numbers.shape != (3,) or numbers.dtype.kind not in "iuf":
+        return None
+    unit = numbers.astype(float)
+    if not np.all(np.isfinite(unit)) or not np.any(unit):
+        return None
+    # The largest is 1 first: squares of huge numbers are none.
+    unit /= np.max(np.abs(unit))
+    return unit / np.linalg.norm(unit)

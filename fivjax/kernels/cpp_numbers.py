@@ -76,7 +76,6 @@ BY_NUMBER = {
     "and": "{} & {}",
     "or": "{} | {}",
     "xor": "{} ^ {}",
-    "shift_right_arithmetic": "{} >> {}",
     "not": "!{}",
     "is_finite": "({0} - {0} == 0.0)",
 }

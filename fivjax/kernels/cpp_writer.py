@@ -262,7 +262,7 @@ class Writer:
             which, *cases = operands
             if has_known_numbers(which) and which.size == 1:
                 return cases[int(self.entries(which).item())]
-            if len(cases) > 2:
+            if len(cases) != 2:
                 found = cases[0]
                 for number, case in enumerate(cases[1:], 1):
                     here = self.each("ge", BY_NUMBER["ge"], [which, of_numbers(number)], "bool")

@@ -14,7 +14,7 @@ def checked_direction(direction) -> int:
     """The direction of the belt, which is +1 or -1."""
     if np.ndim(direction) or direction not in (1, -1):
         raise ValueError(f"Argument `direction` must be 1 or -1, but is {direction!r}.")
-    return int(direction)
+    return 1 if direction == 1 else -1
 
 
 def as_scene(system: Structure | Scene, mu, direction: int) -> Scene:

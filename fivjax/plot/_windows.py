@@ -32,7 +32,7 @@ def windows_of(windows) -> list[Window]:
         pairs = np.zeros(1)
     if not pairs.size:
         raise ValueError("Argument `windows` must be a list of windows, such as [(0.1, 0.2)], but is empty.")
-    if pairs.ndim > 2 or pairs.shape[-1] != 2 or not np.all(pairs[..., 0] < pairs[..., 1]):
+    if pairs.ndim not in (1, 2) or pairs.shape[-1] != 2 or not np.all(pairs[..., 0] < pairs[..., 1]):
         raise ValueError(
             "Argument `windows` must be a list of windows, each a start and a later end, such as [(0.1, 0.2)], but is "
             f"{windows!r}."
@@ -43,7 +43,12 @@ def windows_of(windows) -> list[Window]:
 def inside(run: Trajectory, window: Window) -> slice:
     """The rows of a run in a window; refused if there are fewer than two."""
     check_run(run)
-    (window,) = windows_of(window)
+    try:
+        pair = np.asarray(window, float)
+    except (TypeError, ValueError):
+        pair = np.zeros(1)
+    if pair.shape != (2,) or not pair[0] <= pair[1]:
+        raise ValueError(f"Argument `window` must be a start and a later end, such as (0.1, 0.2), but is {window!r}.")
     start, end = np.searchsorted(run.t, window[0]), np.searchsorted(run.t, window[1], side="right")
     if end - start < 2:
         first, last, begin, stop = apart(*window, run.t[0], run.t[-1])

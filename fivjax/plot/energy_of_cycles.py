@@ -101,6 +101,7 @@ def growth(
     """
     check_run(run)
     arguments.one_of("per_cycle", per_cycle, PER_CYCLE)
+    part = inside(run, window)
     figure = new_figure(figure, 8.0, 7.2)
     whole, strip, middle, lower = figure.subplots(4, 1, height_ratios=(2, 0.7, 1.6, 1.6))
     tangential = run.scene.structure.tangential
@@ -111,7 +112,6 @@ def growth(
     strip.plot(run.t, run.status, ".", color=VERMILION, ms=1.0, rasterized=True)
     strip.set(xlabel="time (s)", xlim=(run.t[0], run.t[-1]), ylim=(-0.5, 2.5))
     strip.set_yticks(list(STATUS_NAMES), list(STATUS_NAMES.values()))
-    part = inside(run, window)
     middle.plot(run.t[part], np.asarray(run.velocity)[part, tangential], color=BLUE, lw=1.2)
     middle.axhline(float(run.scene.belt_speed), color=BLACK, ls="--", lw=0.9)
     handles = {"belt speed": Line2D([], [], color=BLACK, ls="--", label="belt speed")}

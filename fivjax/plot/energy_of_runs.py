@@ -40,7 +40,8 @@ def mechanical_energy(
     runs = dict(runs) if isinstance(runs, Mapping) else {"": runs}
     check_runs(runs)
     longest = max(runs.values(), key=lambda run: run.t[-1])
-    windows = windows_of(windows) if len(windows) else [(float(longest.t[0]), float(longest.t[-1]))]
+    whole = isinstance(windows, tuple | list) and not windows
+    windows = [(float(longest.t[0]), float(longest.t[-1]))] if whole else windows_of(windows)
     figure = new_figure(figure, 2.2 + 3.6 * len(windows), 3.4)
     panels = figure.subplots(1, len(windows), sharey=True, squeeze=False)[0]
     for axes, window in zip(panels, windows, strict=True):

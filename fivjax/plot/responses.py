@@ -90,7 +90,8 @@ def phase_plane(
 
         >>> figure = fj.plot.phase_plane(run)
     """
-    arguments.real_number("last", last, minimum=0)
+    if not (isinstance(last, float) and last == np.inf):
+        arguments.real_number("last", last, minimum=0)
     runs = dict(runs) if isinstance(runs, Mapping) else {"": runs}
     check_runs(runs)
     count = max(len(run.scene.structure.contacts) for run in runs.values())

@@ -19,6 +19,9 @@ LAWS = {
     "clipped": (lambda x: jnp.maximum(jnp.exp(x), 1) + jnp.abs(x) + jnp.clip(x, 0, 3), False),
     "a table": (lambda x: jnp.interp(x, jnp.array([0.0, 1.0, 2.0]), jnp.array([3.0, 2.0, 4.0])), False),
     "chosen": (lambda x: jnp.where(x > 2, x, jnp.exp(x)), False),
+    "in pieces": (lambda x: jnp.piecewise(x, [x < 0.1, x > 2], [jnp.sin, jnp.cos, lambda y: jnp.exp(y)]), False),
+    "one of several": (lambda x: jnp.select([x < 0.1, x < 2, x < 3], [x, jnp.exp(x), x * x], 7.0), False),
+    "beyond a table": (lambda x: jnp.exp(x) + jnp.stack([x, x * x]).at[7].get(mode="fill", fill_value=3.0), False),
 }
 
 
@@ -30,6 +33,12 @@ def test_the_series_is_the_law_and_smoothness_is_read_from_its_code(law, smooth)
         beside = 0.25 * RADIUS
         assert np.polyval(c[::-1], beside) == pytest.approx(float(law(jnp.asarray(AT + beside))), rel=1e-14)
         assert is_smooth(law, jnp.asarray(AT)) is smooth
+
+
+def test_complex_numbers_are_refused():
+    """Their real parts alone were taken."""
+    with jax.enable_x64(True), pytest.raises(NotImplementedError, match="Complex numbers"):
+        taylor_coefficients(lambda x: jnp.abs(x + 1j * x * x), jnp.asarray(AT), ORDER)
 
 
 @pytest.mark.parametrize(

@@ -264,7 +264,9 @@ def test_a_scene_prints_its_values(run):
     assert same(rebuilt, run.scene)
 
 
-@pytest.mark.parametrize("value", [None, True, {"a": 1}, [1, "b"], [True], 10**30, "a\0b"])
+@pytest.mark.parametrize(
+    "value", [None, True, {"a": 1}, [1, "b"], [True], 10**30, "a\0b", b"a\0b", np.timedelta64(1, "s"), [[1, 2], [3]]]
+)
 def test_what_no_file_holds_is_refused_by_name(tmp_path, value):
     """Rejects what ended in an error of h5py's that names no attribute."""
     data = xr.Dataset({"v": ("x", np.ones(2), {"own": value})})
@@ -305,3 +307,20 @@ def test_settings_may_be_single_numbers_of_numpy_and_jax(run):
     """They were refused as soon as all was computed."""
     found = labelled(xr.Dataset(), run.scene, t_max=np.float32(3), count=np.int64(2), step=jnp.asarray(0.5))
     assert json.loads(found.attrs["settings"]) == {"t_max": 3.0, "count": 2, "step": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("value", "kept"),
+    [
+        (np.str_("b"), "b"),
+        (np.array(["a", "b"]), ["a", "b"]),
+        ([[1, 2], [3, 4]], [[1, 2], [3, 4]]),
+        (1 + 2j, 1 + 2j),
+        ([jnp.asarray(1.0), 2.0], [1.0, 2.0]),
+        (range(3), [0, 1, 2]),
+    ],
+)
+def test_what_a_file_holds_in_another_form_is_saved(tmp_path, value, kept):
+    data = xr.Dataset({"v": ("x", np.ones(2))}, attrs={"own": value})
+    found = fj.open(fj.save(data, tmp_path / "own.nc")).attrs["own"]
+    assert np.asarray(found).tolist() == kept and data.attrs["own"] is value

@@ -335,7 +335,7 @@ def test_one_window_needs_no_list():
     with pytest.raises(ValueError, match="must be a list of windows"):
         windows_of([])
     assert windows_of(iter(two)) == two
-    for wrong in ((0.2, 0.1), (0.1, np.nan), [0.1, 0.2, 0.3], [(0.1, 0.2), (0.3,)]):
+    for wrong in ((0.2, 0.1), (0.1, np.nan), [0.1, 0.2, 0.3], [(0.1, 0.2), (0.3,)], None, 0.5):
         with pytest.raises(ValueError, match="each a start and a later end"):
             windows_of(wrong)
 
@@ -387,6 +387,8 @@ def test_a_slice_of_a_map_is_selected_by_the_call_that_the_sentence_gives():
         (lambda: plot.response(still(), coordinate="x2"), "`coordinate` must be a whole number"),
         (lambda: plot.energy.growth(None, None, (0.0, 1.0)), "must be a trajectory"),
         (lambda: plot.energy.growth(still(), None, (0.0, 1.0), "work"), "`per_cycle` must be one of"),
+        (lambda: plot.energy.growth(still(), None, [(0.0, 1.0)]), "`window` must be a start and a later end"),
+        (lambda: plot.energy.growth(still(), None, (1.0, 0.0)), "`window` must be a start and a later end"),
     ],
 )
 def test_wrong_objects_are_refused_with_the_call_that_makes_right_ones(call, sentence):
