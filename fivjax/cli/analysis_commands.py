@@ -9,7 +9,6 @@ import tyro
 
 import fivjax as fj
 
-from ..foundation import arguments
 from .options import SceneOptions
 from .outputs import Overwrite, output_paths, write_data, write_picture
 from .parsing import axis, bound, low_pass, pair
@@ -36,6 +35,8 @@ class Cea:
         self.scene.refuse_constant_friction(x=next(iter(along)))
         direction = 1 if self.scene.belt_speed >= 0 else -1
         if self.scene.structure is None or self.scene.load:
+            from ..foundation import arguments
+
             scene = self.scene.scene()
             arguments.names_of_parameters("x", along, scene.parameters)
             structure, dataset = scene.structure, fj.cea.modes(scene, **along)
