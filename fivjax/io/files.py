@@ -5,7 +5,6 @@ import stat
 from io import BytesIO
 from pathlib import Path
 
-from ..foundation import arguments
 from ..foundation.whole_files import try_to_write, write_whole
 
 
@@ -91,8 +90,8 @@ def save_figure(figure, path: str | Path, **options) -> Path:
     """
     if not hasattr(figure, "savefig"):
         raise TypeError(
-            "Argument `figure` must be a matplotlib figure, such as `fj.plot.response(run)`, but is "
-            f"{arguments.describe(figure)}."
+            "Argument `figure` must be a matplotlib figure, such as `fj.plot.response(run)`, but is of type "
+            f"{type(figure).__name__}."
         )
     path = check_writable(path)
     options = {"dpi": 150, "bbox_inches": "tight", "format": path.suffix.lstrip(".") or "png", **options}
