@@ -16,7 +16,7 @@ from .c_functions import compiler
 from .code import source_from_plain, traced_source
 from .cpp_lanes import declarations
 from .lane_functions import AT_A_TIME, LaneFunction
-from .tiered import SOMEWHAT
+from .tiered import QUICKLY, SOMEWHAT
 from .warp_library import gpus_for, warp
 from .xla_calls import Addresses
 
@@ -81,8 +81,10 @@ class Kernel:
         # One program, as everything about a kernel that is traced.
         self.traced_results = jax.jit(self.results)
         names = [f"{name}_" for name in places], [f"{name}_" for name in sizes]
+        # Where values are asked for again and again, derivatives are asked for now and then.
+        level = QUICKLY if width and function.level == SOMEWHAT else function.level
         # What processors hold in one register or two counts as a number, not as a vector.
-        level = max(function.level, SOMEWHAT) if lanes > 1 or width > 8 else function.level
+        level = max(level, SOMEWHAT) if lanes > 1 or width > 8 else level
         self.of_lanes = LaneFunction(body, *names, lanes, before, level)
 
     def launched(
