@@ -141,9 +141,9 @@ def continue_cycle(
             "the modes of two contacts end at the same instant, as where they move alike, and an impact at one changes the "
             "other: such cycles have no branch here."
         )
-    down = follow_branch(family, first, -1.0, (low, high), points)
+    down = follow_branch(family, first, -1.0, points)
     # A closed curve is whole by one half; its first cycle is its last as well. The other may have ended on the way.
-    up = HalfBranch([], down.ending) if down.closed else follow_branch(family, first, 1.0, (low, high), points)
+    up = HalfBranch([], down.ending) if down.closed else follow_branch(family, first, 1.0, points)
     if up.closed:
         down = HalfBranch([], up.ending)
     along = [*reversed(down.points), first, *up.points]

@@ -28,11 +28,9 @@ class HalfBranch(NamedTuple):
     closed: bool = False  # whether it has come back to where it began
 
 
-def follow_branch(
-    family: Family, start: BranchPoint, sense: float, bounds: tuple[float, float], most: int
-) -> HalfBranch:
+def follow_branch(family: Family, start: BranchPoint, sense: float, most: int) -> HalfBranch:
     """The branch in one direction from a cycle, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
-    front = _Front(family, start, sense, bounds)
+    front = _Front(family, start, sense)
     while len(front.points) < most:
         stage(f"following, {len(front.points)} cycles so far")
         if (ended := front.advance()) is not None:
@@ -45,8 +43,8 @@ class _Front:
     on, and the points behind it. Methods that go on return the whole branch where it ends, and None where it does not.
     """
 
-    def __init__(self, family: Family, start: BranchPoint, sense: float, bounds: tuple[float, float]):
-        self.family, self.start, self.sense, self.bounds = family, start, sense, bounds
+    def __init__(self, family: Family, start: BranchPoint, sense: float):
+        self.family, self.start, self.sense = family, start, sense
         tangent = start.curve.tangent(start.cycle, None)
         self.here, self.tangent, self.step = start, tangent * (sense if tangent[-1] >= 0 else -sense), FIRST
         self.points: list[BranchPoint] = []
@@ -56,7 +54,7 @@ class _Front:
         return HalfBranch(self.points, f"At {self.family.name} = {at.cycle.parameter:.12g} {why}.")
 
     def _within(self, cycle: ComputedCycle) -> bool:
-        return self.bounds[0] <= cycle.parameter <= self.bounds[1]
+        return self.family.is_within(cycle.parameter)
 
     def advance(self) -> HalfBranch | None:
         """One step further, or around what is in its way."""
@@ -71,12 +69,11 @@ class _Front:
 
     def _up_to_bound(self, beyond: ComputedCycle) -> HalfBranch | None:
         """To the bound of the parameter before what is `beyond` it, where there are no scenes."""
-        here, bound = self.here.cycle, self._bound_before(beyond)
+        here, along = self.here.cycle, beyond.u - self.here.cycle.u
+        bound = self._bound_before(beyond)
         if here.parameter == bound:
-            return self._to_bound(self.tangent, beyond)
-        share = (bound - here.parameter) / (beyond.parameter - here.parameter)
-        at = self.here.curve.at_parameter(here.u + share * (beyond.u - here.u), bound)
-        last = None if at is None else branch_point(self.family, self.here.curve, at)
+            return self._to_bound(along, beyond)
+        last = self._at_bound(along, bound)
         if last is not None and last.is_real:
             return self._come_to(last, self.here.curve.tangent(last.cycle, self.tangent))
         if self.step <= 100 * SHORTEST:
@@ -85,7 +82,15 @@ class _Front:
         return None
 
     def _bound_before(self, beyond: ComputedCycle) -> float:
-        return self.bounds[0] if beyond.parameter < self.bounds[0] else self.bounds[1]
+        low, high = self.family.bounds
+        return low if beyond.parameter < low else high
+
+    def _at_bound(self, along: Float[np.ndarray, " m"], bound: float) -> BranchPoint | None:
+        """The point with this value of the parameter in the direction `along` from the front."""
+        here = self.here
+        share = (bound - here.cycle.parameter) / (along[-1] * self.family.scale)
+        at = here.curve.at_parameter(here.cycle.u + share * along, bound)
+        return None if at is None else branch_point(self.family, here.curve, at)
 
     def _around_corner(self) -> HalfBranch | None:
         beyond = around_corner(self.family, self.here, self.tangent)
@@ -172,15 +177,12 @@ class _Front:
         """The points up to a bound of the parameter, which lies between the front and what is `beyond` it in the direction
         `along`: with the cycle at the bound, if it is found.
         """
-        family, here = self.family, self.here
         bound = self._bound_before(beyond)
-        reached = f"The bound {family.name} = {bound:.10g} is reached."
-        if here.cycle.parameter == bound:
+        reached = f"The bound {self.family.name} = {bound:.10g} is reached."
+        if self.here.cycle.parameter == bound:
             return HalfBranch(self.points, reached)
-        share = (bound - here.cycle.parameter) / (along[-1] * family.scale)
-        at = here.curve.at_parameter(here.cycle.u + share * along, bound)
-        last = [] if at is None else [branch_point(family, here.curve, at)]
-        return HalfBranch(self.points + [point for point in last if point.is_real], reached)
+        last = self._at_bound(along, bound)
+        return HalfBranch(self.points + ([last] if last is not None and last.is_real else []), reached)
 
     def _over_a_gap(self, at: BranchPoint, otherwise: str) -> HalfBranch | None:
         """Beyond a gap, where the next cycles cannot be followed; where nothing is found there, the branch ends for this

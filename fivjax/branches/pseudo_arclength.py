@@ -35,9 +35,13 @@ class Family(NamedTuple):
         """The scene with this value of the parameter."""
         return moved_along(self.scene, self.direction, parameter - self.value)
 
+    def is_within(self, parameter: float) -> bool:
+        """Whether this value lies within the bounds."""
+        return self.bounds[0] <= parameter <= self.bounds[1]
+
     def is_possible(self, parameter: float) -> bool:
         """Whether there is a scene with this value: a step may come to one beyond the bounds that no scene has."""
-        if self.bounds[0] <= parameter <= self.bounds[1]:
+        if self.is_within(parameter):
             return True
         try:
             self.scene.replace(**{self.name: parameter})

@@ -77,7 +77,7 @@ def transition(
 def stopped(mechanics: Mechanics, contact: Contact, y: State, ended: Bool[Array, "*contacts 2"]) -> State:
     """The state with exactly zero gap where it has closed, and exactly zero slip where slip has ended or the contact stuck."""
     n = degrees_of_freedom(y)
-    touched = (contact.status == Status.DETACH) & ended[..., 0]
+    touched = _has_touched(contact, ended)
     at_rest = ((contact.status == Status.SLIDE) & ended[..., 1]) | (contact.status == Status.STICK)
     return with_contact_coordinates(
         mechanics,
@@ -96,7 +96,7 @@ def _following(
     ended: Bool[Array, "*contacts 2"],
     resolution: Float[Array, ""],
 ) -> tuple[Contact, State]:
-    touched = (contact.status == Status.DETACH) & ended[..., 0]
+    touched = _has_touched(contact, ended)
     y_stopped = stopped(mechanics, contact, y, ended)
 
     def struck() -> State:
@@ -118,6 +118,10 @@ def _following(
             rests, lambda: _rested(mechanics, following, load, gap_rate(mechanics, y_stopped), y_next), lambda: y_next
         )
     return following, on_constraint(mechanics, following, y_next)
+
+
+def _has_touched(contact: Contact, ended: Bool[Array, "*contacts 2"]) -> Bool[Array, "*contacts"]:
+    return (contact.status == Status.DETACH) & ended[..., 0]
 
 
 def _has_lifted(contact: Contact, ended: Bool[Array, "*contacts 2"]) -> Bool[Array, "*contacts"]:
@@ -182,8 +186,9 @@ def _modes_after(
     slides, slips = contact.status == Status.SLIDE, relative_velocity(mechanics, y) != 0
     arrested = slides & slips & (relative_velocity(mechanics, y_next) == 0)
     # A contact that has landed is on the belt, also where no force presses it there.
-    landed = (contact.status == Status.DETACH) & ended[..., 0]
-    going_on = Contact(jnp.where(arrested | landed, Status.STICK, contact.status), contact.direction)
+    going_on = Contact(
+        jnp.where(arrested | _has_touched(contact, ended), Status.STICK, contact.status), contact.direction
+    )
     following = modes_from_forces(mechanics, load, y_next, going_on, jnp.where(over, state_of(contact), NONE))
     idle = own & held & _is_free_of_force(mechanics, load, y_next)
     following = Contact(following.status, jnp.where(idle, edge, following.direction))

@@ -8,12 +8,13 @@ import dataclasses
 import functools
 import inspect
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import numpy as np
 
+from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..io.datasets import about
 from ..model.contact_coordinates import from_contact_coordinates, to_contact_coordinates, transformation
@@ -49,10 +50,7 @@ def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
             given[name] = _inside(scene, given[name], name)
         # Anything else is refused by the function.
         starts = given.get("starts")
-        listed = (
-            isinstance(starts, Iterable) and not isinstance(starts, str | Mapping) and getattr(starts, "ndim", 1) > 0
-        )
-        if "starts" in names and listed:
+        if "starts" in names and arguments.is_listed(starts):
             given["starts"] = [_inside(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
         given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
         return _outside(scene, call(**given))

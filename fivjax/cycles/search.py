@@ -1,7 +1,7 @@
 """Limit cycles: motions are released, their attractors are found as those of a map are, and described."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -132,8 +132,7 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
         'periodic'
     """
     check_scene(scene)
-    # An array without axes is iterable by its type alone.
-    if isinstance(starts, str | Mapping) or not isinstance(starts, Iterable) or getattr(starts, "ndim", 1) == 0:
+    if not arguments.is_listed(starts):
         raise TypeError(
             f"Argument `starts` must be a list of states `(2n,)` or trajectories, but is {arguments.describe(starts)}."
         )

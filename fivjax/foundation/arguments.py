@@ -146,14 +146,18 @@ def one_of(name: str, value, choices: Iterable[str]) -> None:
         )
 
 
+def is_listed(value) -> bool:
+    """Whether it holds values one after the other: no text, no dictionary, and no single one."""
+    # An array without axes is iterable by its type alone.
+    return isinstance(value, Iterable) and not isinstance(value, str | Mapping) and getattr(value, "ndim", 1) > 0
+
+
 def listed_names(name: str, value, example: str) -> tuple[str, ...]:
     """The names in a list; one name may stand for itself."""
     if isinstance(value, str):
         return (str(value),)
-    # An array without axes is iterable by its type alone.
-    listed = isinstance(value, Iterable) and not isinstance(value, Mapping) and getattr(value, "ndim", 1) > 0
-    names = tuple(value) if listed else ()
-    if not listed or not all(isinstance(one, str) for one in names):
+    names = tuple(value) if is_listed(value) else ()
+    if not is_listed(value) or not all(isinstance(one, str) for one in names):
         raise TypeError(f'Argument `{name}` must be a list of names, such as ["{example}"], but is {describe(value)}.')
     # Those of an array are NumPy's own, which JAX takes for arrays.
     return tuple(map(str, names))

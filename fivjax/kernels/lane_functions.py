@@ -41,8 +41,7 @@ class LaneFunction:
         latest; that is for CPUs only. `before` are declarations. `level` is the first one of a `TieredFunction`.
         """
         self.body, self.addresses, self.numbers = body, tuple(addresses), tuple(numbers)
-        self.side_by_side, self.before = side_by_side, before
-        self.level = level
+        self.side_by_side, self.before, self.level = side_by_side, before, level
 
     @functools.cached_property
     def on_cpu(self) -> Callable:

@@ -26,10 +26,7 @@ def shade(axes: Axes, run: Trajectory, part: slice) -> dict:
 def windows_of(windows) -> list[Window]:
     """The windows of a list, or of an array; a single pair is one."""
     windows = list(windows) if isinstance(windows, Iterator) else windows
-    try:
-        pairs = np.asarray(windows, float)
-    except (TypeError, ValueError):
-        pairs = np.zeros(1)
+    pairs = _numbers(windows)
     if not pairs.size:
         raise ValueError("Argument `windows` must be a list of windows, such as [(0.1, 0.2)], but is empty.")
     if pairs.ndim not in (1, 2) or pairs.shape[-1] != 2 or not np.all(pairs[..., 0] < pairs[..., 1]):
@@ -40,13 +37,18 @@ def windows_of(windows) -> list[Window]:
     return [(start, end) for start, end in pairs.reshape(-1, 2).tolist()]
 
 
+def _numbers(value) -> np.ndarray:
+    """The numbers of a window, or of several; a single one where they are none."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        return np.zeros(1)
+
+
 def inside(run: Trajectory, window: Window) -> slice:
     """The rows of a run in a window; refused if there are fewer than two."""
     check_run(run)
-    try:
-        pair = np.asarray(window, float)
-    except (TypeError, ValueError):
-        pair = np.zeros(1)
+    pair = _numbers(window)
     if pair.shape != (2,) or not pair[0] <= pair[1]:
         raise ValueError(f"Argument `window` must be a start and a later end, such as (0.1, 0.2), but is {window!r}.")
     start, end = np.searchsorted(run.t, window[0]), np.searchsorted(run.t, window[1], side="right")
