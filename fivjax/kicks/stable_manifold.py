@@ -69,20 +69,21 @@ def saddle_passed(scene: Scene, path: Crossings) -> Saddle | None:
     maps = ReturnMaps.of(scene)
     weights, y = maps.weights, maps.weights * path.y[: path.count]
     sizes = np.linalg.norm(y, axis=-1)
-    tried = []
+    with_events, without = [], []
     for count in range(1, MOST_POINTS + 1):
         if len(y) <= count + 1:
             continue
-        back = np.linalg.norm(y[count:] - y[:-count], axis=-1) / sizes[:-count]
-        if scene.friction.constant:
-            # Returns without events do not count: sliding that fades slowly repeats well, too, and has no saddle.
-            back = np.where(path.events[count : path.count] > path.events[: path.count - count], back, np.inf)
-        lowest = (back[1:-1] <= back[:-2]) & (back[1:-1] <= back[2:])
-        places = np.flatnonzero(lowest) + 1
-        tried += [(back[place] * (1 + 0.5 * (count - 1)), count, int(place)) for place in places]
-    for back, count, place in sorted(tried)[:TRIED]:
-        if not back < 0.2:
-            break
+        # The more crossings in between, the better a motion has to repeat.
+        back = (1 + 0.5 * (count - 1)) * np.linalg.norm(y[count:] - y[:-count], axis=-1) / sizes[:-count]
+        eventful = path.events[count : path.count] > path.events[: path.count - count]
+        for tried, meant in ((with_events, eventful), (without, ~eventful)):
+            one = np.where(meant, back, np.inf)
+            lowest = (one[1:-1] <= one[:-2]) & (one[1:-1] <= one[2:])
+            places = np.flatnonzero(lowest & (one[1:-1] < 0.2)) + 1
+            tried += [(one[place], count, int(place)) for place in places]
+    # Sliding that fades slowly repeats well, too: under constant friction it has no saddle, under other laws one seldom.
+    guesses = sorted(with_events)[:TRIED] + ([] if scene.friction.constant else sorted(without)[:TRIED])
+    for _, count, place in guesses:
         contact = Contact(np.asarray(path.status[place], np.int32), np.asarray(path.direction[place]))
         closed = close_near(maps, Point(np.asarray(path.y[place]), contact), count)
         found = None if closed is None else saddle_of(closed, weights)

@@ -181,6 +181,28 @@ def test_a_saddle_may_slide_all_the_time():
     assert verdicts.tolist() == [0, 1]
 
 
+@pytest.mark.slow
+def test_a_saddle_is_found_although_sliding_fades_slowly_beyond_it():
+    """Under falling friction. Sliding repeats better than the motion near the saddle, which swings in another mode yet: `kind`
+    was "none".
+    """
+    structure = fj.Structure(
+        np.diag([0.904, 1.831, 1.405]),
+        [[0.258, -0.139, -0.035], [-0.139, 0.358, 0.031], [-0.035, 0.031, 0.283]],
+        [[1993.0, -1100.9, -377.0], [-1100.9, 2501.2, 248.5], [-377.0, 248.5, 2086.4]],
+        [0.0, -1.0, -0.386],
+        contacts=[fj.ContactPoint(0, 1)],
+    )
+    scene = fj.Scene(structure, fj.ExponentialDecay(0.805, 0.46, 0.555), load=fj.Pulse(2.0, p=3.0, duration=0.397))
+    step = 1e-6
+    speeds = np.array([0.1154 - step, 0.1154, 0.1154 + step])
+    found = fj.critical_perturbation(scene, belt_speed=speeds, p_range=(2.0, 2.6), derivatives=True, progress=False)
+    assert set(found["kind"].values) == {"manifold"}
+    low, _, high = found["p_crit"].values
+    slope = found["d_p_crit"].sel(parameter="belt_speed").values[1]
+    assert slope == pytest.approx((high - low) / (2 * step), rel=1e-5)
+
+
 def test_a_long_kick_has_its_derivatives():
     """While it lasts the motion has as many steps as it takes; those after it are counted anew."""
     found = fj.critical_perturbation(
