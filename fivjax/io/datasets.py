@@ -89,6 +89,8 @@ def check_axis_names(axes: Iterable[str], results: Collection[str], of: str) -> 
             )
 
 
+# Attributes of a variable by which readers of files, xarray among them, change its values; and a unit that makes dates of them.
+CHANGING, DATES = ("scale_factor", "add_offset", "_FillValue", "missing_value", "dtype", "_Unsigned"), " since "
 # Suffixes of what `save` does not write.
 OTHERS = (".csv", ".txt", ".zarr", ".npz", ".npy", ".mat", ".xlsx", ".json", ".parquet", ".png", ".pdf", ".svg")
 
@@ -105,8 +107,9 @@ def save(result, path: str | Path) -> Path:
 
     **Returns:** the path.
 
-    **Raises:** `TypeError` for an object that is no result, or has an attribute that no file holds; `ValueError` for a path
-    that cannot be written or leads to no file (a folder, a device, a FIFO); `OSError` if the disk is full.
+    **Raises:** `TypeError` for an object that is no result, or has an attribute that no file holds; `ValueError` for an
+    attribute by which other values would be read, and for a path that cannot be written or leads to no file (a folder, a
+    device, a FIFO); `OSError` if the disk is full.
 
     **Example:**
 
@@ -180,6 +183,11 @@ def _with_kept_attributes(dataset: "xr.Dataset") -> "xr.Dataset":
         for name, value in part.attrs.items():
             if not isinstance(name, str):
                 raise TypeError(f"Attributes of the {of} must have texts as names, but one is called {name!r}.")
+            if part is not kept and (name in CHANGING or (name == "units" and DATES in str(value))):
+                raise ValueError(
+                    f"Attribute `{name}` of the {of} is {value!r}: by that, other values would be read from the file than were "
+                    f"saved. Give it another name, or change the values themselves."
+                )
             try:
                 part.attrs[name] = _kept_form(value)
             except (TypeError, ValueError):

@@ -115,6 +115,10 @@ def read_recording(
         base = float(rate)
     else:
         raise ValueError(f"File `{path}` has no column `t` or `time`; name it with `time`, or give `rate` in Hz.")
+    if own := {"t", "signals"} & set(about):
+        raise TypeError(
+            f"Argument `{min(own)}` is read from the file. Name its time base with `time`, and its channels with `columns`."
+        )
     try:
         recording = Recording(base, signals, regime, **about)
     except ValueError as error:

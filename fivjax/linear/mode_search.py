@@ -32,7 +32,7 @@ STRIP = 0.5
 ROUNDING = 64 * np.finfo(float).eps
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class ComplexModes:
     """Modes sorted by frequency, one of each conjugate pair.
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 
-@dataclasses.dataclass(frozen=True, repr=False, init=False)
+@dataclasses.dataclass(frozen=True, repr=False, init=False, eq=False)
 class Pencil:
     r"""Small motions $M \ddot q + C \dot q + K q = 0$ whose matrices need not be symmetric.
 

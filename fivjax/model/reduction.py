@@ -18,7 +18,7 @@ from .structure import Structure
 from .structure_checks import lowest_modes
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Reduction:
     """A reduced structure, the way back to the full one, and how well its frequencies are kept.
 

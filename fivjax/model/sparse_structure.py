@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class SparseStructure:
     r"""A linear structure with frictional contacts and very many degrees of freedom, as `fj.read_structure` gives it.
 

@@ -2,8 +2,10 @@
 
 import base64
 import html
+import inspect
 import io
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -31,30 +33,45 @@ def show(result, **options) -> Figure:
 
     **Returns:** a matplotlib figure.
 
-    **Raises:** `TypeError` for anything that fivjax did not compute, `ValueError` for a dataset without a picture, or with more
-    axes than one has.
+    **Raises:** `TypeError` for anything that fivjax did not compute, and for an option that its picture does not have;
+    `ValueError` for a dataset without a picture, or with more axes than one has.
 
     **Example:**
 
         >>> figure = fj.show(run)
     """
+    draw, drawn = _picture_of(result)
+    of_picture = plot.response if draw in (_of_trajectory, _of_cycle) else draw
+    # The first is what is drawn.
+    known = list(inspect.signature(of_picture).parameters)[1:]
+    for name in options:
+        if name not in known:
+            raise TypeError(
+                f"Argument `{name}` is no option of this picture, which is `{of_picture.__name__}` of `fj.plot`; it has: "
+                f"{', '.join(known)}.{arguments.did_you_mean(name, known)}"
+            )
+    return draw(drawn, **options)
+
+
+def _picture_of(result) -> tuple[Callable[..., Figure], Any]:
+    """The function that draws a result, and what it draws."""
     import xarray as xr
 
     if isinstance(result, Trajectory):
-        return _of_trajectory(result, **options)
+        return _of_trajectory, result
     if isinstance(result, LimitCycle):
-        return _of_trajectory(result.trajectory(), of_phase_plane=1.0, **options)
+        return _of_cycle, result
     if isinstance(result, Sensitivity):
-        return plot_linear.sensitivity(result.dataset, **options)
+        return plot_linear.sensitivity, result.dataset
     if isinstance(result, Calibration):
-        return plot.calibration(result, **options)
+        return plot.calibration, result
     if isinstance(result, xr.Dataset) and "fivjax" in result.attrs:
         _refuse_more_axes(result)
         for is_one, draw in _PICTURES:
             if is_one(result):
-                return draw(result, **options)
+                return draw, result
         if "displacement" in result and "status" in result:
-            return _of_trajectory(Trajectory.from_dataset(result), **options)
+            return _of_trajectory, Trajectory.from_dataset(result)
         raise ValueError(
             f"Argument `result` is a dataset of fivjax's with {', '.join(map(str, result.data_vars))} over "
             f"{', '.join(f'{name} ({size})' for name, size in result.sizes.items()) or 'no axis'}, of which there is no "
@@ -101,6 +118,11 @@ def _of_trajectory(run: Trajectory, of_phase_plane: float = 0.25, figure: Figure
     plot.response(run, **options, figure=left)  # pyright: ignore[reportArgumentType]
     plot.phase_plane(run, last=of_phase_plane * float(run.t[-1]), figure=right)  # pyright: ignore[reportArgumentType]
     return figure
+
+
+def _of_cycle(cycle: LimitCycle, **options) -> Figure:
+    """One period of it."""
+    return _of_trajectory(cycle.trajectory(), of_phase_plane=1.0, **options)
 
 
 def png(figure: Figure) -> bytes:

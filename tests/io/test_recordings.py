@@ -177,6 +177,12 @@ def test_bad_recordings(make, fragments):
         assert fragment in str(refusal.value)
 
 
+def test_what_is_read_from_the_file_is_not_given(tmp_path):
+    path = csv(tmp_path, table("t,a0", zip(T, A, strict=True)))
+    with pytest.raises(TypeError, match="Argument `t` is read from the file"):
+        fj.read_recording(path, t=T)
+
+
 def test_two_columns_of_one_channel_are_refused(tmp_path):
     path = csv(tmp_path, table("t,a0,acceleration 0", zip(T, A, A, strict=True)))
     with pytest.raises(

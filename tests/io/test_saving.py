@@ -275,6 +275,15 @@ def test_what_no_file_holds_is_refused_by_name(tmp_path, value):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("attribute", [{"scale_factor": 2.0}, {"_FillValue": 1.0}, {"units": "s since 2000-01-01"}])
+def test_what_would_be_read_as_other_values_is_refused(tmp_path, attribute):
+    """Values came back doubled, as NaN, or not at all."""
+    data = xr.Dataset({"v": ("x", np.ones(2), attribute)})
+    with refused(ValueError, f"`{next(iter(attribute))}`", "variable `v`"):
+        fj.save(data, tmp_path / "own.nc")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_parameter_of_a_structure_is_none_of_a_law_that_does_without(tmp_path):
     """`Coulomb` has an optional `mu_static`: a scene that comes back must not find it in the structure."""
 

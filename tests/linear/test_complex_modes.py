@@ -122,6 +122,8 @@ def test_dense_modes_of_unsymmetric_matrices():
     massless = fj.cea.Pencil(np.diag([1.0, 0.0]), np.zeros((2, 2)), np.array([[3.0, -1.0], [-1.0, 1.0]]))
     # The second coordinate follows the first; a spring of 2 is left.
     np.testing.assert_allclose(fj.cea.complex_modes(massless).eigenvalues, [1j * np.sqrt(2)], atol=1e-12)
+    # Comparing two was an error: arrays have no single truth.
+    assert massless == massless and massless != pencil and len({massless, pencil}) == 2
 
 
 @pytest.mark.parametrize("mass", [1e-12, 1e-9, 1e12])

@@ -61,6 +61,10 @@ def test_show_draws_what_has_a_picture(run, tmp_path):
     assert fj.show(run, figure=own) is own and len(own.axes) == 2
     fj.save(run, tmp_path / "run.nc")
     assert isinstance(fj.show(fj.open(tmp_path / "run.nc")), Figure)
+    with refused(
+        TypeError, "Argument `quantities` is no option", "`response` of `fj.plot`", "Did you mean `quantity`?"
+    ):
+        fj.show(run, quantities="velocity")
     with refused(TypeError, "can draw"):
         fj.show(xr.Dataset({"verdict": (("mu", "p"), np.zeros((2, 2)))}))
 
