@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..foundation.linear_solve import inverse, solve
 from ..foundation.matrix_routines import eigenvalues
@@ -32,46 +32,56 @@ class Limit(NamedTuple):
     code: Float[Array, ""]  # index into CODES
 
 
+class _StateSpace(NamedTuple):
+    """A loop as a first-order system of displacements and velocities, with its mass divided out."""
+
+    stiffness: Float[Array, "m m"]
+    damping: Float[Array, "m m"]
+    column: Float[Array, " m"]
+    # Of displacements and velocities, in what the loop feeds back; of the input itself, at once.
+    row_position: Float[Array, " m"]
+    row_velocity: Float[Array, " m"]
+    impulsive: Float[Array, ""]
+
+    @classmethod
+    def of(cls, loop: Loop) -> "_StateSpace":
+        m = loop.mass.shape[0]
+        solved = solve(loop.mass, jnp.concatenate([loop.stiffness, loop.damping, loop.column[:, None]], axis=1))
+        stiffness, damping, column = solved[:, :m], solved[:, m : 2 * m], solved[:, 2 * m]
+        row_position = loop.row_stiffness - loop.row_mass @ stiffness
+        row_velocity = loop.row_damping - loop.row_mass @ damping
+        return cls(stiffness, damping, column, row_position, row_velocity, loop.limits[1])
+
+    @property
+    def matrix(self) -> Float[Array, "2m 2m"]:
+        """Of the open loop."""
+        eye, none = np.eye(len(self.column)), np.zeros(self.damping.shape)
+        return jnp.block([[none, eye], [-self.stiffness, -self.damping]])
+
+    @property
+    def input(self) -> Float[Array, " 2m"]:
+        return jnp.concatenate([jnp.zeros(len(self.column)), self.column])
+
+    @property
+    def row(self) -> Float[Array, " 2m"]:
+        return jnp.concatenate([self.row_position, self.row_velocity])
+
+    def is_unstable(self, gain: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether the closed loop grows at this gain."""
+        closed = self.matrix + jnp.outer(self.input, self.row) * gain / (1 - gain * self.impulsive)
+        return significant_growth(in_natural_units(closed, 1.0)) > 0
+
+
 @jax.custom_jvp
 def first_limit(loop: Loop) -> Limit:
     """The smallest gain just above which the loop is unstable, found by checking every crossing."""
-    m = loop.mass.shape[0]
-    eye, none = np.eye(m), np.zeros((m, m))
-    solved = solve(loop.mass, jnp.concatenate([loop.stiffness, loop.damping, loop.column[:, None]], axis=1))
-    stiffness, damping, column = solved[:, :m], solved[:, m : 2 * m], solved[:, 2 * m]
-    row_position = loop.row_stiffness - loop.row_mass @ stiffness
-    row_velocity = loop.row_damping - loop.row_mass @ damping
-
-    static, impulsive = loop.limits
-
-    # Crossings: L(s) - L(-s) = 2s c (s² - A²)⁻¹ b with the loop's state matrix A. In units of the damping, so that light
-    # damping does not lose digits.
-    unit = jnp.max(jnp.abs(damping)) + jnp.max(jnp.abs(row_velocity))
-    unit = jnp.where(unit > 0, unit, 1.0)
-    squared = jnp.block([[-stiffness, -damping / unit], [unit * damping @ stiffness, damping @ damping - stiffness]])
-    output = jnp.concatenate([row_position, row_velocity / unit])
-    # Coalescence of an undamped loop: dL/ds² = -c (s² + M⁻¹K)⁻² b.
-    chained = jnp.block([[-stiffness, eye], [none, -stiffness]])
-    chained_output = jnp.concatenate([row_position, jnp.zeros(m)])
-    input_ = jnp.concatenate([jnp.zeros(m), column])
-    squares = jax.vmap(_zeros, in_axes=(0, None, 0, None))(
-        jnp.stack([squared, chained]), input_, jnp.stack([output, chained_output]), _scales(stiffness)
-    ).ravel()
-    omega = jnp.sqrt(jnp.maximum(-squares.real, 0.0))
-    inverse_gain = jax.vmap(lambda w: loop(1j * w).real)(omega)
-    real_frequency = (squares.real < 0) & (jnp.abs(squares.imag) < 1e-6 * jnp.abs(squares))
-    inverse_gain = jnp.where(real_frequency, inverse_gain, 0.0)
-    inverse_gain = jnp.concatenate([inverse_gain, jnp.stack([static, impulsive])])
-    omega = jnp.concatenate([omega, jnp.array([0.0, jnp.inf])])
-    each = squares.size // 2
-    codes = jnp.array([FLUTTER] * each + [COALESCENCE] * each + [DIVERGENCE, PAINLEVE], jnp.int32)
-    state = jnp.block([[none, eye], [-stiffness, -damping]])
-    row = jnp.concatenate([row_position, row_velocity])
-    typical = 1 / (jnp.abs(impulsive) + jnp.linalg.norm(row) * jnp.linalg.norm(column))
+    system = _StateSpace.of(loop)
+    inverse_gain, omega, codes = _crossings(loop, system)
+    typical = 1 / (jnp.abs(system.impulsive) + jnp.linalg.norm(system.row) * jnp.linalg.norm(system.column))
     typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
     usable = jnp.isfinite(inverse_gain) & (inverse_gain > 0)
     # A mode without damping lies on the imaginary axis already at gain zero, which is no crossing.
-    values = eigenvalues(in_natural_units(state, 1.0))
+    values = eigenvalues(in_natural_units(system.matrix, 1.0))
     marginal = jnp.any(values.real > -1e-11 * jnp.abs(values))
     usable = usable & ~(marginal & (codes == FLUTTER) & (inverse_gain * typical > 1e5))
     # With damping, undamped modes that meet say nothing; but they may do so at the very gain of a crossing: where it is equal.
@@ -86,17 +96,13 @@ def first_limit(loop: Loop) -> Limit:
     between = jnp.minimum(0.5 * (lower + upper), jnp.maximum(2 * lower, typical))
     empty = ~jnp.isfinite(lower) | (upper <= lower * (1 + 1e-11))
 
-    def unstable(gain):
-        closed = state + jnp.outer(input_, row) * gain / (1 - gain * impulsive)
-        return significant_growth(in_natural_units(closed, 1.0)) > 0
-
     def not_found(carry):
         i, found = carry
         return (i < lower.size) & ~found
 
     def step(carry):
         i, _ = carry
-        return i + 1, ~empty[i] & unstable(between[i])
+        return i + 1, ~empty[i] & system.is_unstable(between[i])
 
     i, found = jax.lax.while_loop(not_found, step, (jnp.zeros((), jnp.int32), jnp.array(False)))
     last = i - 1
@@ -145,6 +151,35 @@ def _(primals, tangents):
     inverse_gain_change = jnp.where(limit.code == PAINLEVE, impulsive_change, inverse_gain_change)
     tangent = Limit(-(limit.gain**2) * inverse_gain_change, omega_change, jnp.zeros_like(limit.code))
     return limit, tangent
+
+
+def _crossings(loop: Loop, system: _StateSpace) -> tuple[Float[Array, " k"], Float[Array, " k"], Int[Array, " k"]]:
+    """The inverse of the gain, the frequency and the kind of all crossings; the inverse is zero where there is none."""
+    m = len(system.column)
+    eye, none = np.eye(m), np.zeros((m, m))
+    stiffness, damping = system.stiffness, system.damping
+    # L(s) - L(-s) = 2s c (s² - A²)⁻¹ b with the loop's state matrix A. In units of the damping, so that light damping does not
+    # lose digits.
+    unit = jnp.max(jnp.abs(damping)) + jnp.max(jnp.abs(system.row_velocity))
+    unit = jnp.where(unit > 0, unit, 1.0)
+    squared = jnp.block([[-stiffness, -damping / unit], [unit * damping @ stiffness, damping @ damping - stiffness]])
+    output = jnp.concatenate([system.row_position, system.row_velocity / unit])
+    # Coalescence of an undamped loop: dL/ds² = -c (s² + M⁻¹K)⁻² b.
+    chained = jnp.block([[-stiffness, eye], [none, -stiffness]])
+    chained_output = jnp.concatenate([system.row_position, jnp.zeros(m)])
+    squares = jax.vmap(_zeros, in_axes=(0, None, 0, None))(
+        jnp.stack([squared, chained]), system.input, jnp.stack([output, chained_output]), _scales(stiffness)
+    ).ravel()
+    omega = jnp.sqrt(jnp.maximum(-squares.real, 0.0))
+    inverse_gain = jax.vmap(lambda w: loop(1j * w).real)(omega)
+    real_frequency = (squares.real < 0) & (jnp.abs(squares.imag) < 1e-6 * jnp.abs(squares))
+    inverse_gain = jnp.where(real_frequency, inverse_gain, 0.0)
+    each = squares.size // 2
+    return (
+        jnp.concatenate([inverse_gain, jnp.stack(loop.limits)]),
+        jnp.concatenate([omega, jnp.array([0.0, jnp.inf])]),
+        jnp.array([FLUTTER] * each + [COALESCENCE] * each + [DIVERGENCE, PAINLEVE], jnp.int32),
+    )
 
 
 def _scales(stiffness: Float[Array, "m m"]) -> Float[Array, " 3"]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..attractors.catalogue import Attractors, CapturingSet
 from ..attractors.cycles import CROSSINGS, MORE_CROSSINGS
@@ -25,6 +25,7 @@ from .capture import Capture, attractor_columns
 from .following import Batch, advance_all, begin_all
 from .groups import Task, groups_of
 from .job_files import JobFile, JobState
+from .one_trajectory import Progress
 from .results import Verdicts, not_run, record
 
 # How long trajectories are followed after the last jump of their load, unless told: so many periods of the slowest mode, or so
@@ -95,81 +96,125 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     Those found already are the known attractors of groups, by the group's parameters. `report` is told how many trajectories
     have ended. The file keeps the state between rounds, and has the one from which an interrupted run goes on.
     """
-    task, (verdicts, known) = job.task, results
-    of_groups, group = groups_of(job.values, (*task.of_kick, *task.states))
-    of_groups, seeds = with_seeding(of_groups, job.seeding[np.unique(group, return_index=True)[1]])
-    batch = Batch(task, of_groups, pool)
-    own = [job.values[name] for name in (*task.of_kick, *task.states)]
-    columns = np.stack([np.zeros(len(group)), *own], axis=-1)[:, 1:]
-    pending = np.arange(len(group))
-    trajectories = begin_all(batch, group, columns)
-    capture = Capture(batch, of_groups, group, seeds, report)
-    # After so many rounds the attractors of the groups of those that are undecided are computed; those that are undecided later
-    # ask for a cycle of their own, each time after twice the steps.
-    known_from, own_from = 4 * task.method.round, 16 * task.method.round
-    limit = task.limits.t_max
-    if limit is None:
-        period = np.asarray(batch.constants.modes.slowest_period)
-        limit = np.where(period > 0, PERIODS * period, WITHOUT_PERIOD)
-    limit = np.broadcast_to(limit, len(of_groups))
-    done = 0
+    following = _Following(job, pool, results, report)
     if (earlier := file.last()) is not None:
-        done, own_from, pending = earlier.done, earlier.own_from, earlier.pending
-        trajectories = Flattened(earlier.numbers, trajectories.form)
-        capture.go_on(earlier)
-        known.update(earlier.searched)
-        for whole, part in zip(jax.tree.leaves(verdicts), jax.tree.leaves(earlier.verdicts), strict=True):
-            whole[:] = part
-        report(len(group) - len(pending))
-
-    def state() -> JobState:
-        return JobState(done, own_from, verdicts, pending, trajectories.numbers, dict(known), *capture.state())
-
-    # Rounds from which on cycles of many crossings are tried, too: locked tori, whose neighbours are followed for long
-    # anyway.
-    more_from = 64
+        following.go_on(earlier)
+        report(len(job.seeding) - len(following.pending))
     while True:
-        _, now = trajectories.tree
-        verdict = np.array(now.verdict)
-        if task.limits.t_max is None:
-            in_time = now.t - now.skipped - now.last_jump < np.maximum(limit, capture.settled_by)[group[pending]]
-            # On a slow belt events are rare, and their steps are few: first the attractors are computed.
-            in_time |= done <= known_from
-        else:
-            in_time = now.t < limit[group[pending]]
+        ended = following.conclude()
+        # A run that begins here comes to the same: it finds nothing more to conclude.
+        file.note(following.state(), at_once=following.asks_for_attractors)
+        report(ended)
+        if not len(following.pending):
+            return
+        following.search(lambda: file.note(following.state()))
+        file.moving()
+        following.advance()
+
+
+class _Following:
+    """The trajectories of a job that have no verdict yet, and how far they have come. In each round those that have one leave
+    (`conclude`), attractors are looked for at times (`search`), and the others go on (`advance`).
+    """
+
+    # After so many rounds the attractors of the groups of those that are undecided are computed; those that are undecided later
+    # ask for one of their own, each time after twice the steps.
+    GROUPS_AFTER, OWN_AFTER = 4, 16
+    # Rounds from which on cycles of many crossings are tried, too: locked tori, whose neighbours are followed for long anyway.
+    MORE_AFTER = 64
+
+    def __init__(self, job: Job, pool: Executor, results: Done, report: Callable[[int], None]):
+        self.task, (self.verdicts, self.known) = job.task, results
+        task = self.task
+        of_groups, self.group = groups_of(job.values, (*task.of_kick, *task.states))
+        of_groups, seeds = with_seeding(of_groups, job.seeding[np.unique(self.group, return_index=True)[1]])
+        self.batch = Batch(task, of_groups, pool)
+        self.pending = np.arange(len(self.group))
+        own = [job.values[name] for name in (*task.of_kick, *task.states)]
+        columns = np.stack([np.zeros(len(self.group)), *own], axis=-1)[:, 1:]
+        self.trajectories = begin_all(self.batch, self.group, columns)
+        self.capture = Capture(self.batch, of_groups, self.group, seeds, report)
+        limit = task.limits.t_max
+        if limit is None:
+            period = np.asarray(self.batch.constants.modes.slowest_period)
+            limit = np.where(period > 0, PERIODS * period, WITHOUT_PERIOD)
+        self.limit = np.broadcast_to(limit, len(of_groups))
+        self.done, self.own_from = 0, self.OWN_AFTER * task.method.round
+
+    @property
+    def groups_from(self) -> int:
+        """Steps of each trajectory after which the attractors of groups are computed."""
+        return self.GROUPS_AFTER * self.task.method.round
+
+    @property
+    def asks_for_attractors(self) -> bool:
+        """Whether `search` looks for attractors now."""
+        return self.done == self.groups_from or self.done >= self.own_from
+
+    def state(self) -> JobState:
+        """From which another run goes on."""
+        verdicts, numbers = self.verdicts, self.trajectories.numbers
+        return JobState(
+            self.done, self.own_from, verdicts, self.pending, numbers, dict(self.known), *self.capture.state()
+        )
+
+    def go_on(self, earlier: JobState) -> None:
+        """From where another run has come to."""
+        self.done, self.own_from, self.pending = earlier.done, earlier.own_from, earlier.pending
+        self.trajectories = Flattened(earlier.numbers, self.trajectories.form)
+        self.capture.go_on(earlier)
+        self.known.update(earlier.searched)
+        for whole, part in zip(jax.tree.leaves(self.verdicts), jax.tree.leaves(earlier.verdicts), strict=True):
+            whole[:] = part
+
+    def conclude(self) -> int:
+        """Write the verdicts of those that have one, or whose time is over, and leave them out. How many these are."""
+        task, pending, now = self.task, self.pending, self.trajectories.tree[1]
+        verdict, in_time = np.array(now.verdict), self._in_time(now)
         entered: dict[int, CapturingSet] = {}
-        if done > known_from:
-            entered = capture.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
+        if self.done > self.groups_from:
+            entered = self.capture.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
             verdict[list(entered)] = Verdict.LIMIT_CYCLE
-        if done >= task.limits.max_steps:
+        if self.done >= task.limits.max_steps:
             # Only now: their last steps may have led them to an attractor.
             verdict = np.where((verdict == Verdict.UNDECIDED) & in_time, Verdict.STEP_FAILURE, verdict)
         finished = (verdict != Verdict.UNDECIDED) | ~in_time
         # Who says how long to follow says which motions count.
-        late = capture.at_last(
+        late = self.capture.at_last(
             pending, now, finished & (verdict == Verdict.UNDECIDED), proving=task.limits.t_max is None
         )
         verdict[list(late.attractor)], verdict[late.sliding] = Verdict.LIMIT_CYCLE, Verdict.SLIDING
         ended = verdict, attractor_columns(len(pending), entered | late.attractor, late.chaotic)
         rows = np.flatnonzero(finished)
-        record(verdicts, pending[finished], *(_rows(part, rows) for part in (late.now, *ended)))
-        pending, trajectories = pending[~finished], trajectories.compacted(np.flatnonzero(~finished))
-        # A run that begins here comes to the same: it finds nothing more to conclude.
-        file.note(state(), at_once=done == known_from or done >= own_from)
-        report(int(finished.sum()))
-        if not len(pending):
-            return
-        if done == known_from:
-            capture.search(np.unique(group[pending]), known, lambda: file.note(state()))
-        elif done >= own_from:
-            crossings = CROSSINGS if done < more_from * task.method.round else MORE_CROSSINGS
-            capture.search_alone(pending, trajectories.tree[1], crossings)
-            own_from = 2 * done
-        # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
-        steps = min(max(task.method.round, done // 8), max(task.limits.max_steps - done, 1))
-        file.moving()
-        advance_all(batch, group[pending], trajectories, steps)
-        done += steps
+        record(self.verdicts, pending[finished], *(_rows(part, rows) for part in (late.now, *ended)))
+        self.pending, self.trajectories = pending[~finished], self.trajectories.compacted(np.flatnonzero(~finished))
+        return len(rows)
+
+    def _in_time(self, now: Progress) -> Bool[np.ndarray, " m"]:
+        """Which trajectories are followed on, if they have no verdict."""
+        group = self.group[self.pending]
+        if self.task.limits.t_max is not None:
+            return np.asarray(now.t) < self.limit[group]
+        long = np.maximum(self.limit, self.capture.settled_by)[group]
+        # On a slow belt events are rare, and their steps are few: first the attractors are computed.
+        return np.asarray(now.t - now.skipped - now.last_jump < long) | (self.done <= self.groups_from)
+
+    def search(self, keep: Callable[[], None]) -> None:
+        """Look for attractors where it is time to; `keep` is called now and then meanwhile."""
+        task = self.task
+        if self.done == self.groups_from:
+            self.capture.search(np.unique(self.group[self.pending]), self.known, keep)
+        elif self.done >= self.own_from:
+            crossings = CROSSINGS if self.done < self.MORE_AFTER * task.method.round else MORE_CROSSINGS
+            self.capture.search_alone(self.pending, self.trajectories.tree[1], crossings)
+            self.own_from = 2 * self.done
+
+    def advance(self) -> None:
+        """A round of steps. Trajectories that have taken long may take longer: rounds grow longer, in proportion."""
+        task = self.task
+        steps = min(max(task.method.round, self.done // 8), max(task.limits.max_steps - self.done, 1))
+        advance_all(self.batch, self.group[self.pending], self.trajectories, steps)
+        self.done += steps
 
 
 def with_seeding(
