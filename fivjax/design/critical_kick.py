@@ -8,7 +8,7 @@ within the bounds, found by sequential quadratic programming: in each step p_cri
 at the end of the step it is computed anew. A step whose gain falls short of the linear prediction is halved.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -121,8 +121,6 @@ def raise_critical_perturbation(
         >>> raised.reached  # doctest: +SLOW
         True
     """
-    # A step predicted to gain less than this share of what is missing is not tried.
-    promising = 1e-2
     names, start, low, high = _checked(scene, by, free, bounds)
     arguments.whole_number("steps", steps, minimum=2)
     size = np.abs(start)
@@ -136,50 +134,17 @@ def raise_critical_perturbation(
         slopes = np.array([float(found["d_p_crit"].sel(parameter=name)) for name in names]) * size
         return _Iterate(changed, r, float(found["p_crit"]), slopes, _bracket(found), str(found["why_none"].values))
 
-    here = first = at(np.zeros(len(names)))
-    if not here.is_known:
+    first = at(np.zeros(len(names)))
+    if not first.is_known:
         raise ValueError(
-            f"The scene has no critical kick with derivatives to start from: {here.why}. "
+            f"The scene has no critical kick with derivatives to start from: {first.why}. "
             "Change `p_range`, or the scene."
         )
     target = (1 + by) * first.p
     if target >= p_range[1]:
         aim, end = apart(target, p_range[1])
         raise ValueError(f"Argument `p_range` must hold the target {aim}, but ends at {end}. Raise its upper end.")
-    aim, taken, why = target * (1 + 0.5 * MET), 1, ""
-    before, beside_kink = np.inf, False
-    while taken < steps:
-        ahead = smallest_change(here.slopes, aim - here.p + here.slopes @ here.r, low, high) - here.r
-        met = target <= here.p <= target * (1 + MET)
-        length = np.linalg.norm(ahead)
-        # Where two crossings take turns as the first, slopes jump, and steps go to and fro: then straight to the target.
-        beside_kink |= bool(length > 0.9 * before and abs(aim - here.p) <= NEAR * by * first.p)
-        before = length
-        if beside_kink:
-            ahead = np.clip(here.r + (aim - here.p) * here.slopes / (here.slopes @ here.slopes), low, high) - here.r
-            length = np.linalg.norm(ahead)
-        if met and (beside_kink or length <= SETTLED * np.linalg.norm(here.r)):
-            break
-        promised, missing = here.slopes @ ahead, abs(aim - here.p)
-        if length <= 1e-9 or (not met and abs(promised) < promising * missing):
-            break
-        following, share = None, 1.0
-        for _ in range(HALVINGS):
-            if taken == steps:
-                break
-            tried, taken = at(here.r + share * ahead), taken + 1
-            # Near the target a step misses it by its curvature, which the next step corrects.
-            allowed = max(
-                (1 - KEPT * share * abs(promised) / max(missing, MET * target)) * missing, NEAR * by * first.p
-            )
-            if tried.is_known and abs(aim - tried.p) <= allowed:
-                following = tried
-                break
-            why = tried.why
-            share *= 0.5
-        if following is None:
-            break
-        here, why = following, ""
+    here, taken, why = _climbed(at, first, target, (low, high), steps)
     anew = critical_perturbation(here.scene, p_range=p_range, p_step=p_step, progress=False)
     anew = anew.squeeze(anew["p_crit"].dims)
     ended = np.array([float(np.asarray(here.scene.parameters[name])) for name in names])
@@ -208,6 +173,53 @@ class _Iterate(NamedTuple):
     def why(self) -> str:
         """Why they are not there; empty if they are."""
         return "" if self.is_known else self.why_none or "p_crit or one of its derivatives does not exist"
+
+
+def _climbed(
+    at: Callable[[np.ndarray], _Iterate],
+    first: _Iterate,
+    target: float,
+    bounds: tuple[np.ndarray, np.ndarray],
+    steps: int,
+) -> tuple[_Iterate, int, str]:
+    """Where the search for the target ends, for how many scenes p_crit was computed, and why no further scene had one; `at`
+    gives what is known at relative changes, which have `bounds`.
+    """
+    # A step predicted to gain less than this share of what is missing is not tried.
+    promising = 1e-2
+    here, near, aim, taken, why = first, NEAR * (target - first.p), target * (1 + 0.5 * MET), 1, ""
+    before, beside_kink = np.inf, False
+    while taken < steps:
+        ahead = smallest_change(here.slopes, aim - here.p + here.slopes @ here.r, *bounds) - here.r
+        met = target <= here.p <= target * (1 + MET)
+        length = np.linalg.norm(ahead)
+        # Where two crossings take turns as the first, slopes jump, and steps go to and fro: then straight to the target.
+        beside_kink |= bool(length > 0.9 * before and abs(aim - here.p) <= near)
+        before = length
+        if beside_kink:
+            ahead = np.clip(here.r + (aim - here.p) * here.slopes / (here.slopes @ here.slopes), *bounds) - here.r
+            length = np.linalg.norm(ahead)
+        if met and (beside_kink or length <= SETTLED * np.linalg.norm(here.r)):
+            break
+        promised, missing = here.slopes @ ahead, abs(aim - here.p)
+        if length <= 1e-9 or (not met and abs(promised) < promising * missing):
+            break
+        following, share = None, 1.0
+        for _ in range(HALVINGS):
+            if taken == steps:
+                break
+            tried, taken = at(here.r + share * ahead), taken + 1
+            # Near the target a step misses it by its curvature, which the next step corrects.
+            allowed = max((1 - KEPT * share * abs(promised) / max(missing, MET * target)) * missing, near)
+            if tried.is_known and abs(aim - tried.p) <= allowed:
+                following = tried
+                break
+            why = tried.why
+            share *= 0.5
+        if following is None:
+            break
+        here, why = following, ""
+    return here, taken, why
 
 
 def _bracket(found) -> tuple[float, float]:
