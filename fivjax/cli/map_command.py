@@ -6,7 +6,7 @@ import shutil
 import threading
 import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import tyro
 
@@ -37,6 +37,17 @@ Resume = Annotated[
         str_from_instance=lambda instance: [] if instance is None else [str(instance)],
     ),
 ]
+
+
+class _Files(NamedTuple):
+    """The files of a map."""
+
+    data: Path
+    picture: Path
+    folder: Path | None  # the store that is asked for, which keeps the map also when it is finished
+    # Where it is kept meanwhile otherwise; and the files of its jobs.
+    unfinished: Path
+    jobs: Path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,31 +81,8 @@ class Map:
         import numpy as np
 
         from ..maps.axes import checked_axes
-        from ..maps.checkpoint import jobs_beside
 
-        # When the interrupted map was begun, its files were checked already.
-        (unfinished,) = output_paths(self.out, True, ".unfinished")
-        asked = self.resume is not None
-        folder = None if self.resume == Path() else self.resume
-        if folder is not None and folder.suffix != ".zarr":
-            raise ValueError(f"Option `--resume` must name a folder that ends in .zarr, but is `{folder}`.")
-        jobs = jobs_beside(unfinished)
-        begun = [path for path in (unfinished, jobs) if path.exists()]
-        going_on = asked and bool(folder.exists() if folder else begun)
-        data, picture = output_paths(self.out, self.overwrite or going_on, ".nc", ".png")
-        axes = dict(map(axis, (self.x, self.y)))
-        if len(axes) != 2:
-            raise ValueError(f"A map needs two different parameters, but --x and --y are both {next(iter(axes))}.")
-        self.scene.refuse_constant_friction(**dict(zip(("x", "y"), axes, strict=True)))
-        if self.scene.belt_speed == 0 and "belt_speed" not in axes:
-            raise ValueError(
-                "Option `--belt-speed` must not be zero: a map starts from steady sliding, which a belt at rest does not have."
-            )
-        if begun and not asked:
-            raise ValueError(
-                f"A map is kept in {_listed(begun)}, which was interrupted, or which another process is computing. Go on with "
-                f"it by `--resume`, or delete that to begin anew."
-            )
+        files, axes = self._files(), self._axes()
         scene, method = self.scene.scene(), self.method.stepper()
         # The name of an option of maps would be taken for that.
         checked_axes(scene, axes)
@@ -109,37 +97,77 @@ class Map:
                     method=method,
                     t_max=self.t_max,
                     memory=self.memory,
-                    resume=folder or unfinished,
+                    resume=files.folder or files.unfinished,
                     refine=self.refine,
                     executor=executor,
                     **axes,
                 )
             if np.any(dataset["verdict"] == fj.Verdict.NOT_RUN):
                 raise KeyboardInterrupt
-            write_data(dataset, data)
-            write_picture(fj.plot.bistability(dataset), picture)
+            write_data(dataset, files.data)
+            write_picture(fj.plot.bistability(dataset), files.picture)
         except KeyboardInterrupt:
-            raise Interrupted(_how_to_resume(folder, unfinished, jobs)) from None
-        if folder is None:
-            unfinished.unlink(missing_ok=True)
-            shutil.rmtree(jobs, ignore_errors=True)
-        counts = {verdict: int((dataset["verdict"] == verdict).sum()) for verdict in fj.Verdict}
-        for verdict, count in counts.items():
-            if count:
-                print(f"  {counted(count, 'trajectory', 'trajectories'):>20s}: {verdict.words}")
-        if not any(counts[verdict] for verdict in fj.Verdict if verdict >= fj.Verdict.UNDECIDED):
-            reasons = ", ".join(verdict.words for verdict, count in counts.items() if count)
-            raise Failure(f"No trajectory of the map could be followed: {dataset.attrs.get('failure', reasons)}.")
+            raise Interrupted(_how_to_resume(files)) from None
+        if files.folder is None:
+            files.unfinished.unlink(missing_ok=True)
+            shutil.rmtree(files.jobs, ignore_errors=True)
+        _print_counts(dataset)
+
+    def _files(self) -> _Files:
+        """Where the map goes, and where it is kept meanwhile."""
+        from ..maps.checkpoint import jobs_beside
+
+        # When the interrupted map was begun, its files were checked already.
+        (unfinished,) = output_paths(self.out, True, ".unfinished")
+        asked = self.resume is not None
+        folder = None if self.resume == Path() else self.resume
+        if folder is not None and folder.suffix != ".zarr":
+            raise ValueError(f"Option `--resume` must name a folder that ends in .zarr, but is `{folder}`.")
+        jobs = jobs_beside(unfinished)
+        begun = [path for path in (unfinished, jobs) if path.exists()]
+        if begun and not asked:
+            raise ValueError(
+                f"A map is kept in {_listed(begun)}, which was interrupted, or which another process is computing. Go on with "
+                f"it by `--resume`, or delete that to begin anew."
+            )
+        going_on = asked and bool(folder.exists() if folder else begun)
+        return _Files(*output_paths(self.out, self.overwrite or going_on, ".nc", ".png"), folder, unfinished, jobs)
+
+    def _axes(self) -> dict:
+        """The parameters of the axes, with their values."""
+        axes = dict(map(axis, (self.x, self.y)))
+        if len(axes) != 2:
+            raise ValueError(f"A map needs two different parameters, but --x and --y are both {next(iter(axes))}.")
+        self.scene.refuse_constant_friction(**dict(zip(("x", "y"), axes, strict=True)))
+        if self.scene.belt_speed == 0 and "belt_speed" not in axes:
+            raise ValueError(
+                "Option `--belt-speed` must not be zero: a map starts from steady sliding, which a belt at rest does not have."
+            )
+        return axes
+
+
+def _print_counts(dataset) -> None:
+    """Print how many trajectories have each verdict.
+
+    **Raises:** `Failure` if none has one.
+    """
+    counts = {verdict: int((dataset["verdict"] == verdict).sum()) for verdict in fj.Verdict}
+    for verdict, count in counts.items():
+        if count:
+            print(f"  {counted(count, 'trajectory', 'trajectories'):>20s}: {verdict.words}")
+    if not any(counts[verdict] for verdict in fj.Verdict if verdict >= fj.Verdict.UNDECIDED):
+        reasons = ", ".join(verdict.words for verdict, count in counts.items() if count)
+        raise Failure(f"No trajectory of the map could be followed: {dataset.attrs.get('failure', reasons)}.")
 
 
 def _listed(paths: list[Path]) -> str:
     return " and ".join(f"`{path}`" for path in paths)
 
 
-def _how_to_resume(folder: Path | None, *files: Path) -> str:
-    if folder is not None:
-        return f"Interrupted; what is finished is kept in `{folder}`. Go on with the same command."
-    kept = [path for path in files if path.exists()]
+def _how_to_resume(files: _Files) -> str:
+    if files.folder is not None:
+        return f"Interrupted; what is finished is kept in `{files.folder}`. Go on with the same command."
+    kept = [path for path in (files.unfinished, files.jobs) if path.exists()]
     if not kept:
         return "Interrupted before any trajectory was finished; nothing was written."
     return f"Interrupted; what is finished is kept in {_listed(kept)}. Go on with the same command and `--resume`."
