@@ -7,12 +7,17 @@ A thread inside compiled code cannot be stopped. So it is waited for only for a 
 """
 
 import contextlib
+import contextvars
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import TypeVar
 
+from .precision import own_settings
 from .signals import handled, handled_as_before
+
+R = TypeVar("R")
 
 # How long threads are waited for once a run is to stop, s.
 PATIENCE = 2.0
@@ -43,6 +48,28 @@ def stop_requests() -> Iterator[list[int]]:
         handled_as_before(before)
         if caught and before[caught[0]] is not signal.default_int_handler:
             signal.raise_signal(caught[0])
+
+
+def interruptible(call: Callable[[], R]) -> R:
+    """The result of a call that is inside compiled code for long. It runs in a thread, which a signal leaves behind at once: it
+    goes on for nobody until it ends, or the process does.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return call()
+    context, outcome = contextvars.copy_context(), Future()
+
+    def run() -> None:
+        try:
+            with own_settings():
+                outcome.set_result(context.run(call))
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    # A signal that comes just before waiting begins is handled when it ends, so it ends soon.
+    while not outcome.done():
+        wait([outcome], timeout=0.2)
+    return outcome.result()
 
 
 @contextlib.contextmanager

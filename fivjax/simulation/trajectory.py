@@ -25,6 +25,7 @@ from ..foundation.precision import (
     refusing_reverse_in_single_precision,
 )
 from ..foundation.progress import following, tick
+from ..foundation.stopping import interruptible
 from ..io.datasets import labelled
 from ..model.contact_coordinates import transformation
 from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
@@ -207,8 +208,8 @@ def simulate(
         >>> run.displacement.shape, run.meaning
         ((401, 3), 'reached its end')
     """
-    # The most rows that a trajectory may have: some 20 GB.
-    most_rows = 10**8
+    # The most rows that a trajectory may have: some 20 GB. And the most steps between two of them.
+    most_rows, most_steps = 10**8, 10**9
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
@@ -240,6 +241,11 @@ def simulate(
     # The quotient is rounded: by that alone there is no row more.
     rows = max(math.ceil(asked * (1 - 1e-12) - 1e-9), 1)
     start, given = ("sliding equilibrium", None) if y0 is None else ("given by y0", start_state(scene, y0))
+    if dt_save / method.dt > most_steps:
+        raise ValueError(
+            f"Argument `method` has steps of {method.dt:g} s, of which {dt_save / method.dt:.3g} lie between two saved rows; "
+            f"the most is {most_steps:.0e}. Give it a larger `dt`, or lower `dt_save`."
+        )
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)
     most = steps + MOST_ADVANCES
@@ -251,7 +257,13 @@ def simulate(
         if given is None:
             refuse_without_equilibrium(scene)
         with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
-            ending, found = rows_by_kernel(scene, method, given, saved, most, bool(energy))
+
+            def follow():
+                return rows_by_kernel(scene, method, given, saved, most, bool(energy))
+
+            # From some milliseconds on.
+            long = len(saved) * max(steps, 1) > 2e4 and is_known(jax.tree.leaves((scene, method, given)))
+            ending, found = interruptible(follow) if long else follow()
             tick(len(saved) - 1)
     else:
         y0 = start_state(scene, None) if given is None else given

@@ -1,5 +1,9 @@
 """Trajectories against the independent oracle, and the three transients of Section 3."""
 
+import os
+import signal
+import threading
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -10,6 +14,7 @@ from scipy.integrate import solve_ivp
 import fivjax as fj
 from fivjax.contact import Status
 from fivjax.foundation.compiling import compiled
+from fivjax.simulation import trajectory
 from fivjax.simulation.rows import IN_A_PART
 from tests.helpers import oracle
 from tests.helpers.catalogue import LOW_ORDER, QUICK, steady
@@ -419,3 +424,25 @@ def test_a_motion_fades_to_nothing_and_the_run_goes_on():
     decay = np.exp(-run.t) * (np.cos(3 * run.t) + np.sin(3 * run.t) / 3)
     np.testing.assert_allclose(run.displacement[:13, 0], 0.01 * decay[:13], rtol=1e-9)
     assert np.all(np.abs(run.displacement[15:, 0]) < 1e-300)
+
+
+def test_a_long_run_obeys_ctrl_c(paper_scene, monkeypatch):
+    """It is inside compiled code, where Python handles no signal."""
+    inside, ends = threading.Event(), threading.Event()
+
+    def compiled_code(*_):
+        inside.set()
+        ends.wait(60)
+
+    monkeypatch.setattr(trajectory, "rows_by_kernel", compiled_code)
+    threading.Thread(target=lambda: inside.wait(60) and os.kill(os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        fj.simulate(paper_scene, 10.0)
+    assert not ends.is_set()
+    ends.set()
+
+
+def test_steps_of_no_length_are_refused(paper_scene):
+    """They would take weeks."""
+    with pytest.raises(ValueError, match=r"has steps of 1e-14 s, of which 1e\+10 lie between two saved rows"):
+        fj.simulate(paper_scene, 1.0, method=fj.EventExact(dt=1e-14))
