@@ -131,7 +131,8 @@ class Map:
                 f"it by `--resume`, or delete that to begin anew."
             )
         going_on = asked and bool(folder.exists() if folder else begun)
-        return _Files(*output_paths(self.out, self.overwrite or going_on, ".nc", ".png"), folder, unfinished, jobs)
+        data, picture = output_paths(self.out, self.overwrite or going_on, ".nc", ".png")
+        return _Files(data, picture, folder, unfinished, jobs)
 
     def _axes(self) -> dict:
         """The parameters of the axes, with their values."""
