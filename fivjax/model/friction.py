@@ -37,7 +37,8 @@ class AbstractFriction(eqx.Module):
       Unless defined, nothing is known, and such verdicts stay undecided.
     - `constant` says that μ never changes.
     - `smooth` says whether μ has no kinks, at speeds above zero. Unless said, that is read from the code: a law that compares,
-      clips or takes from a table may have some. Then a bound on $|μ''|$ is worth nothing and is not used.
+      clips, takes from a table or takes a root of what may be zero may have some. Then a bound on $|μ''|$ is worth nothing and
+      is not used.
 
     A scene checks this where values are known, at slip speeds from 0 to ten times the belt's, and holds the law's numbers in
     double precision. Fields are the law's parameters; what `replace` and maps change must be a field that the constructor takes
