@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..section.return_maps import ReturnMaps, Section, section_at
+from ..section.return_maps import ReturnMaps, Section
 from .motions import Motions
 
 # Growth is measured over so many returns, at most so often: the first returns turn deviations to where they grow. On a torus
@@ -108,7 +108,7 @@ def diverges_along(
     for start in range(0, states.shape[1] - RETURNS_ALONG, RETURNS_ALONG):
         here, there = states[:, start], states[:, start + RETURNS_ALONG]
         apart = np.linalg.norm(maps.weights * (beside - here), axis=1)
-        at = section_at(beside, maps.normal, maps.sliding[group])
+        at = maps.with_modes(group, beside)
         away = maps.weights * (maps.returns(group, at, RETURNS_ALONG).at.y - there)
         size = np.linalg.norm(maps.weights * there, axis=1, keepdims=True)
         beside, distance = _brought_near(maps, there, away, size)
@@ -117,7 +117,7 @@ def diverges_along(
         furthest = np.fmax(furthest, parted)
     chaotic, rows = np.zeros(len(group), bool), np.flatnonzero(~(furthest < suspicious))
     if len(rows):
-        at = section_at(states[rows, -1], maps.normal, maps.sliding[group[rows]])
+        at = maps.with_modes(group[rows], states[rows, -1])
         chaotic[rows] = long_divergence(maps, Motions(group[rows], at), parted_on_torus).chaotic
     return chaotic
 

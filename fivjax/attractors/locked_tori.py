@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..section.return_maps import ReturnMaps, section_at
+from ..section.return_maps import ReturnMaps
 from .cycles import MOST_CROSSINGS, Recurrence, StableCycle, stable_cycles
 from .motions import Motions, extent
 
@@ -63,7 +63,7 @@ def _cycles_near(
     if not rows:
         return []
     own, last = group[rows], np.concatenate([ends[row] for row in rows]) / maps.weights
-    at = section_at(last, maps.normal, maps.sliding[own])
+    at = maps.with_modes(own, last)
     if onward:
         at = maps.returns(own, at, onward).at
     known = {int(group[row]): cycles[row] for row in rows}

@@ -5,7 +5,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..section.return_maps import ReturnMaps, Section, section_at
+from ..section.return_maps import ReturnMaps, Section
 from . import tube
 from .motions import Motions
 from .tube import Tube
@@ -68,8 +68,7 @@ def starts_beyond(
 
 def starts_at(maps: ReturnMaps, group: Int[np.ndarray, " s"], states: list[Float[np.ndarray, "m 2n"]]) -> Section:
     """`STARTS` weighted states of each of these groups, as states of the section."""
-    directions = maps.sliding[np.repeat(group, tube.STARTS)]
-    return section_at(np.concatenate(states) / maps.weights, maps.normal, directions)
+    return maps.with_modes(np.repeat(group, tube.STARTS), np.concatenate(states) / maps.weights)
 
 
 def _constraints(maps: ReturnMaps) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " c"]]:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..section.return_maps import ReturnMaps, Section, section_at
+from ..section.return_maps import ReturnMaps, Section
 from .catalogue import Attractors, Catalogue
 from .cycles import AT_FIRST, CROSSINGS, MORE_CROSSINGS, Recurrence
 from .motions import Motions, far_apart
@@ -123,5 +123,5 @@ def _follow_from(maps: ReturnMaps, starts: list, returns: int) -> Motions:
     """Motions from these starts on the section, each with its group, so many returns later."""
     group = np.array([g for g, _ in starts], int)
     y = np.array([y for _, y in starts]).reshape(len(starts), len(maps.weights))
-    at = section_at(y, maps.normal, maps.sliding[group])
+    at = maps.with_modes(group, y)
     return Motions(group, maps.returns(group, at, returns).at)

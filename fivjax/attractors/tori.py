@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..section.return_maps import ReturnMaps, section_at
+from ..section.return_maps import ReturnMaps
 from . import tube
 from .cycles import (
     AT_FIRST,
@@ -310,7 +310,7 @@ def around_stable_cycles(
     middles = [(row, one) for row in rows for one in _middles(traced[row])]
     rows, own = [row for row, _ in middles], np.array([group[row] for row, _ in middles])
     states = np.array([one for _, one in middles]) / maps.weights
-    at = section_at(states, maps.normal, maps.sliding[own])
+    at = maps.with_modes(own, states)
     found = set()
     # By Newton's method, which may lead astray from there; and from where motions lead.
     for returns, recurrence in ((0, AT_FIRST), (128, Recurrence(nearly=0.01))):

@@ -151,6 +151,11 @@ def _struck(
         y_struck = jnp.where(rising, y, impact(mechanics, y))
     own = gap_rate(mechanics, y_struck)
     rests = rising | (touched & _ends_within(resolution, own, fall))
+    if mechanics.several:
+        # An impact elsewhere may lift one off that is on the belt, and would be back at once.
+        lifted = reached & (contact.status != Status.DETACH) & (own > 0)
+        free = Contact(jnp.where(lifted, Status.DETACH, contact.status), contact.direction)
+        rests = rests | (lifted & _ends_within(resolution, own, _fall(mechanics, free, load, y)))
     return with_contact_coordinates(
         mechanics,
         y_struck,

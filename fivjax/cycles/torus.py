@@ -19,7 +19,7 @@ from ..attractors.tori import Torus
 from ..contact import Contact
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
-from ..section.return_maps import ReturnMaps, section_at
+from ..section.return_maps import ReturnMaps
 from .cycle import LimitCycle, under_final_load
 from .one_period import follow_period, word
 
@@ -30,7 +30,7 @@ POINTS, WINDOW = 2304, 96
 def limit_cycle_of_torus(maps: ReturnMaps, scene: Scene, torus: Torus) -> LimitCycle:
     """The description of a torus of the only group."""
     weights, only = maps.weights, np.zeros(1, int)
-    start = section_at(torus.tube.states[-1:] / weights, maps.normal, maps.sliding[only])
+    start = maps.with_modes(only, torus.tube.states[-1:] / weights)
     start = maps.returns(only, start, 1).at
     found = maps.returns(only, start, POINTS, POINTS)
     points, rotation, residual = _curve(weights, found.path[0])
@@ -143,7 +143,7 @@ def _lyapunov_exponents(maps: ReturnMaps, path: Float[np.ndarray, "k state"]) ->
     # What is left of a direction that is taken away is rounding.
     rounding = 1e-12
     weights, basis, logs, group = maps.weights, np.eye(len(maps.weights)), [], np.zeros(exponent_returns, int)
-    along = section_at(path[:exponent_returns], maps.normal, maps.sliding[group])
+    along = maps.with_modes(group, path[:exponent_returns])
     _, _, derived = maps.derived(group, along, 1)
     for jacobian in derived:
         basis, upper = np.linalg.qr((weights[:, None] * jacobian / weights) @ basis)

@@ -79,14 +79,6 @@ class Section(NamedTuple):
         return flatten((np.asarray(self.y), status, direction, *more))
 
 
-def section_at(
-    y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray, direction: Float[np.ndarray, "m *contacts"]
-) -> Section:
-    """States of the section with the contact mode that they tell, and the direction of friction if they slide."""
-    status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
-    return Section(y, status, np.where(status == Status.SLIDE, direction, 1.0))
-
-
 class Images(NamedTuple):
     """The images of several states under the return map; NaN where the section is not reached."""
 
@@ -119,8 +111,6 @@ class ReturnMaps:
         self.shared = mechanics, longest
         self.structure = structure
         self.weights = weights_of(structure)
-        # The direction of friction if the contact slides on the section, where the belt is faster.
-        self.sliding = np.sign(np.asarray(mechanics.belt_speed))
         self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL
         # With several contacts, arrays of indices.
         self.tangential, self.normal = contact_coordinates(self.structure)
@@ -152,6 +142,18 @@ class ReturnMaps:
         own = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(group)[rows]], self.shared[0])
         contact = _contacts_demanded(own, y[rows])
         return Section(y.copy(), *(np.asarray(part)[: len(y)] for part in (contact.status, contact.direction)))
+
+    def with_modes(self, group, y: Float[np.ndarray, "m 2n"]) -> Section:
+        """States of the section with the modes that gaps and slips tell. What has come to its belt's speed sticks to it."""
+        velocities = self.structure.size + self.tangential
+        belt = np.asarray(self.shared[0].belt_speed)[group]
+        slip = y[:, velocities] - belt
+        # Weighted states were divided by their weights.
+        at_belt = np.abs(slip) <= 4 * np.finfo(float).eps * np.abs(belt)
+        y, open_ = y.copy(), y[:, self.normal] > 0
+        y[:, velocities] = np.where(at_belt & ~open_, belt, y[:, velocities])
+        status = np.where(open_, int(Status.DETACH), np.where(at_belt, int(Status.STICK), int(Status.SLIDE)))
+        return Section(y, status.astype(np.int32), np.where(status == Status.SLIDE, -np.sign(slip), 1.0))
 
     def moves(self, group, y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
         """Which of these deviations from sliding are of a motion that has not faded."""
@@ -276,7 +278,7 @@ class ReturnMaps:
             # The last states of each motion are kept, the newest last.
             path = self.returns(group, at, crossings, most).path
             y = path[row[later], most - crossings[row[later]] + DIFFERENCED * part[later] - 1]
-            starts.put(later, section_at(y, self.normal, self.sliding[group[row[later]]]))
+            starts.put(later, self.with_modes(group[row[later]], y))
         counts = np.minimum(DIFFERENCED, crossings[row] - DIFFERENCED * part)
         ends, times, slopes = self._differences_of_few(group[row], starts, counts)
         last = np.cumsum(parts) - 1

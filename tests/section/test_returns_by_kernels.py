@@ -12,7 +12,7 @@ from fivjax.maps.groups import Task, constants_of
 from fivjax.section.about_sliding import sliding_state
 from fivjax.section.by_kernel import section_kernels
 from fivjax.section.free_directions import directions_of_several, zero_on_section
-from fivjax.section.return_maps import KEPT, Images, ReturnMaps, Section, section_at
+from fivjax.section.return_maps import KEPT, Images, ReturnMaps, Section
 
 CROSSINGS = 6
 
@@ -39,7 +39,7 @@ def starts(maps, exactly) -> tuple[np.ndarray, Section]:
     """Groups and states on the section, from small ones, which slide, to large ones, which stick and lift off."""
     group = np.arange(24) % 3
     states = np.random.default_rng(3).normal(size=(24, 6)) * np.geomspace(0.1, 8.0, 24)[:, None]
-    at = section_at(np.where(np.arange(6) == 3, 0.0, states) / maps.weights, maps.normal, np.ones(len(states)))
+    at = maps.with_modes(group, np.where(np.arange(6) == 3, 0.0, states) / maps.weights)
     closed = at.status[:, None] != fj.Status.DETACH
     at = at._replace(y=np.where(closed & np.isin(np.arange(6), (2, 5)), 0.0, at.y))
     # Where the velocity rises, as it does on the section, and not only is zero.
@@ -163,3 +163,30 @@ def test_without_kernels_the_last_of_many_states_are_kept(crossings, kept, monke
     assert found.at.y[:, 0].tolist() == [crossings, 100 + crossings] and found.time.tolist() == [crossings] * 2
     assert found.events.tolist() == [2 * crossings] * 2
     np.testing.assert_array_equal(found.path[1, :, 0], 100 + np.arange(crossings - kept + 1, crossings + 1))
+
+
+def test_of_several_contacts_the_one_that_sticks_goes_on_to_stick():
+    """Static friction is larger: one that was taken to slide, at the belt's speed, was another motion. So were the parts of which
+    derivatives over many crossings are made.
+    """
+    rng, n = np.random.default_rng(3), 5
+    a, b = rng.standard_normal((2, n, n)) / np.sqrt(n)
+    matrices = np.eye(n) + 0.06 * a @ a.T, 0.02 * np.eye(n), 2 * (np.eye(n) + b @ b.T)
+    structure = fj.Structure(*matrices, [0, 0, -1, -1, 0], contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(1, 3)])
+    scene = fj.Scene(structure, fj.Coulomb(0.2, 0.5), 0.2, fj.ConstantLoad(10.0))
+    with jax.enable_x64(True):
+        maps, one = ReturnMaps.of(scene), np.zeros(1, int)
+        at = maps.in_contact(one, 0.3 * rng.standard_normal((1, 10)) * np.array([1, 1, 0, 0, 1] * 2))
+        start = at = maps.returns(one, at, 60).at
+        seen, product = set(), np.eye(10)
+        for _ in range(17):
+            seen.add(tuple(at.status[0].tolist()))
+            told = maps.with_modes(one, maps.weights * at.y / maps.weights)
+            for own, other in zip(at, told, strict=True):
+                np.testing.assert_allclose(other, own, rtol=1e-15)
+            at, _, slope = maps.derived(one, at, 1)
+            product = slope[0] @ product
+        end, _, derived = maps.derived(one, start, 17)
+    assert seen == {(0, 1), (1, 0)}
+    np.testing.assert_allclose(end.y, at.y, atol=1e-12 * np.abs(at.y).max())
+    np.testing.assert_allclose(derived[0], product, atol=1e-6 * np.abs(product).max())

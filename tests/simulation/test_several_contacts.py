@@ -8,6 +8,7 @@ import dataclasses
 import inspect
 from unittest.mock import Mock
 
+import diffrax
 import jax
 import numpy as np
 import pytest
@@ -564,3 +565,20 @@ def test_two_equal_contacts_break_away_at_the_same_instant(static, belt):
     for contact in (0, 1):
         np.testing.assert_array_equal(both.status[:, contact], np.ravel(alone.status))
         np.testing.assert_allclose(both.velocity[:, 2 * contact], alone.velocity[:, 0], atol=1e-12)
+
+
+def test_steps_of_one_length_come_to_rest_where_an_impact_lifts_another_contact():
+    """The mass matrix couples the two: each landing lifted the other off, step by step, for ever."""
+    mass = np.eye(4)
+    mass[2, 3] = mass[3, 2] = -0.5
+    stiffness = np.diag([30.0, 40.0, 200.0, 300.0])
+    structure = fj.Structure(
+        mass, 0.01 * stiffness, stiffness, [0, 0, -1, -1], contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(1, 3)]
+    )
+    scene = fj.Scene(structure, fj.Coulomb(0.2), np.ones(2), fj.ConstantLoad(10.0), impact_law="frictionless")
+    y0 = [0.0, 0.0, 0.1, 0.0, *np.zeros(4)]
+    exact = fj.simulate(scene, 2.0, 0.01, y0=y0)
+    stepped = fj.simulate(scene, 2.0, 0.01, fj.WhereSwitched(diffrax.Heun(), dt=1e-4), y0=y0)
+    assert np.mean(np.any(stepped.status != exact.status, axis=1)) < 0.02 and np.any(exact.status == 2)
+    # The error is of first order: 6e-3 of the size at 1e-3 s. It was 0.25 with any step.
+    np.testing.assert_allclose(stepped.displacement, exact.displacement, atol=1e-3 * np.abs(exact.displacement).max())
