@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..foundation import arguments
+from ..model.load import load_from
 from ..model.scene import Scene
 from .section import Rise, rise_between
 
@@ -148,7 +149,7 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
             y0, getattr(terms, "direction", 1) < 0, "`t1` must be after `t0`: friction has no way back in time."
         )
         mechanics = Mechanics(args)
-        return StepperState(mechanics, physics.status_from_forces(mechanics, args.load(0.5 * (t0 + t1)), y0))
+        return StepperState(mechanics, physics.status_from_forces(mechanics, load_from(args.load, t0), y0))
 
     def func(self, terms, t0, y0: State, args: Scene) -> State:
         return terms.vf(t0, y0, args)

@@ -181,6 +181,20 @@ def test_plain_diffeqsolve_gives_what_simulate_gives(paper_scene):
 
 
 @pytest.mark.slow
+def test_a_first_step_over_a_jump_of_the_load_begins_in_the_mode_before_it():
+    """It sticks until the load has fallen to a quarter. In the middle of the step it could not."""
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, -1.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.25, 0.5), 0.1, fj.Pulse(0.5, p=4.0, duration=0.3))
+    y0 = np.array([0.9, 0.0, 0.1, 0.0])
+    run = fj.simulate(scene, 1.0, 0.25, LOW_ORDER, y0=y0)
+    assert run.status.tolist()[:3] == [0, 0, 1]
+    with jax.enable_x64(True):
+        term = diffrax.ODETerm(fj.vector_field)
+        solution = diffrax.diffeqsolve(term, LOW_ORDER, 0.0, 1.0, 1.0, jnp.asarray(y0), args=scene)
+    np.testing.assert_allclose(solution.ys[-1, :2], run.displacement[-1], atol=1e-10)
+
+
+@pytest.mark.slow
 def test_event_exact_interpolates_through_events_inside_a_step(paper_scene):
     """The other stepper is one too, and its dense output as exact as the step, also with several events inside one, and with a
     jump of the load.
