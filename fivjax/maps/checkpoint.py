@@ -81,9 +81,15 @@ class Checkpoint:
                 f"File `{self._jobs}` is where the jobs of checkpoint `{self.path}` are kept, in a folder. Move it, or give "
                 f"another path for the checkpoint."
             )
-        with contextlib.suppress(OSError):
-            self._jobs.mkdir(exist_ok=True)
-            return RunLock(self._jobs, f"Checkpoint `{self.path}`")
+        for _ in range(100):
+            try:
+                self._jobs.mkdir(exist_ok=True)
+                return RunLock(self._jobs, f"Checkpoint `{self.path}`")
+            except FileNotFoundError:
+                # Another run has ended in between, and removed it.
+                continue
+            except OSError:
+                break
         return None
 
     def _read(self) -> None:

@@ -226,6 +226,24 @@ def test_a_disk_that_is_really_full_brings_nothing_down(tmp_path):
     assert (done.returncode, done.stdout.strip(), list(tmp_path.iterdir())) == (0, "File too large", [])
 
 
+def test_a_run_is_locked_although_another_one_ends_as_it_begins(tmp_path, monkeypatch):
+    """The other one removes the folder of the lock. Without a lock a third run would write the same file."""
+    path, real = tmp_path / "map.part", checkpoint.RunLock
+    running = [checkpoint.Checkpoint(path, {"a": 1}, 10, False)]
+
+    def after_the_other(*args):
+        if running:
+            running.pop().close()
+        return real(*args)
+
+    monkeypatch.setattr(checkpoint, "RunLock", after_the_other)
+    second = checkpoint.Checkpoint(path, {"a": 1}, 10, False)
+    with pytest.raises(ValueError, match="is being written by another process"):
+        checkpoint.Checkpoint(path, {"a": 1}, 10, False)
+    second.close()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_is_no_checkpoint_is_refused_and_left_alone(paper_scene, tmp_path):
     """A mistyped path does not cost a file."""
     text, result = tmp_path / "notes.txt", tmp_path / "result.nc"
