@@ -192,9 +192,18 @@ def numeric_fields(part: eqx.Module) -> dict[str, Array]:
 
 
 def rebuilt(part, changes: Mapping):
-    """A law or a load with other values of some fields, made by its constructor, to which those without a value are left."""
+    """A law or a load with other values of some fields, made by its constructor, to which those without a value are left.
+
+    **Raises:** `TypeError` for a constructor that asks for numbers that are traced.
+    """
     own = {name: value for name, value in vars(part).items() if value is not None}
-    return type(part)(**{name: changes.get(name, value) for name, value in own.items()})
+    try:
+        return type(part)(**{name: changes.get(name, value) for name, value in own.items()})
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        raise TypeError(
+            f"The constructor of `{type(part).__name__}` must take what JAX traces, but asks for a number, as `float(…)` and "
+            f"`if` do. Keep what it is given by `jnp.asarray`, and leave checks of values to where these are known."
+        ) from error
 
 
 def slope_of(law: AbstractFriction, slip_speed: Float[Array, "*contacts"]) -> Float[Array, "*contacts"]:

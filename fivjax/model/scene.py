@@ -47,7 +47,8 @@ class Scene(eqx.Module):
     - `load`: `ConstantLoad`, `Pulse` or a load of your own; `ConstantLoad()` unless given.
     - `restitution`: Newton's coefficient for the closing gap, 0 (inelastic) to 1. One number, or one for each contact.
     - `impact_law`: what happens where the gap closes: "coulomb" (an impulse with Coulomb friction), "frictionless" (an impulse
-      along the normal alone) or "reset" (the gap stops closing, all other velocities stay).
+      along the normal alone) or "reset" (the gap stops closing, all other velocities stay, of a contact given by vectors
+      those of `in_contact_coordinates`).
 
     **Raises:** `TypeError` or `ValueError`, as a sentence, for parts of the wrong kind or values out of range.
 
@@ -198,7 +199,8 @@ class Scene(eqx.Module):
 def check_corners(scene: Scene, axes: Mapping[str, np.ndarray]) -> None:
     """Check that a scene may have all values of these rising axes of parameters.
 
-    Every rule on parameters is a bound, or an order between two of them, so it holds in the grid where it holds at all corners.
+    Rules on parameters are bounds, or an order between two of them, so they hold in the grid where they hold at all corners;
+    those that a structure of one's own has besides are looked at there only.
 
     **Raises:** whatever `Scene.replace` refuses.
     """
@@ -291,7 +293,7 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
     load = sliding_load(structure, friction)
     reduced = solve(stiffness, load * force)
     # Where the stiffness is singular but for rounding, the displacements are so large that their rounding outweighs the load.
-    rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness)) * jnp.max(jnp.abs(reduced))
+    rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness) @ jnp.abs(reduced))
     reduced = jnp.where(rounding > 1e-3 * jnp.max(jnp.abs(load * force)), jnp.nan, reduced)
     _, normal = contact_coordinates(structure)
     if isinstance(normal, np.ndarray):

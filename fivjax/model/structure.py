@@ -176,7 +176,7 @@ class Structure(eqx.Module):
         self.coordinates = check_names(coordinates, n)
         if contacts is None:
             contacts = [ContactPoint(tangential, normal)]
-        elif (tangential, normal) != (0, 2):
+        elif np.ndim(tangential) or np.ndim(normal) or (tangential, normal) != (0, 2):
             raise ValueError("Give either `contacts`, or `tangential` and `normal` for a single contact, but not both.")
         self.places = tuple(
             (_place(contact.tangential), _place(contact.normal))

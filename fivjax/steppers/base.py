@@ -12,6 +12,7 @@ The state `y` is the displacements followed by the velocities, in m and m/s; `ar
 """
 
 import abc
+import inspect
 from typing import ClassVar, NamedTuple
 
 import diffrax
@@ -156,6 +157,15 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
 
 
 def describe_method(method: AbstractStepper) -> str:
-    """A method with its inner solver and its step, for the provenance of results: "WhereSwitched(Tsit5, dt=0.0001)"."""
-    inner = getattr(method, "solver", None)
-    return f"{type(method).__name__}({'' if inner is None else type(inner).__name__ + ', '}dt={method.dt:g})"
+    """A method with its inner solver, its step, and numbers that are not the usual ones, for the provenance of results:
+    "WhereSwitched(Tsit5, dt=0.0001)".
+    """
+    inner, said = getattr(method, "solver", None), []
+    for name, parameter in inspect.signature(type(method)).parameters.items():
+        usual = parameter.default
+        # diffrax has a method `order`.
+        own = getattr(method, f"{name}_", getattr(method, name, usual))
+        if name != "dt" and isinstance(usual, int | float) and own != usual:
+            said.append(f"{name}={own}")
+    said = [*([] if inner is None else [type(inner).__name__]), *said, f"dt={method.dt:g}"]
+    return f"{type(method).__name__}({', '.join(said)})"
