@@ -105,8 +105,8 @@ def nearby_cycle(scene: Scene, cycle: LimitCycle, *, stages: int = 1, multiplier
     before, after = cycle.scene, under_final_load(scene)
     if jax.tree.structure(before) != jax.tree.structure(after):
         raise ValueError(
-            "Argument `cycle` must be of a scene with as many coordinates, and friction and impacts of the same kind, as "
-            "`scene`; compute one with `fivjax.limit_cycle(scene)`."
+            "Argument `cycle` must be of a scene with as many coordinates, made by the same functions, and with friction and "
+            "impacts of the same kind, as `scene`; compute one with `fivjax.limit_cycle(scene)`."
         )
     found = next_to(after, before, point_of(cycle), jnp.asarray(cycle.crossings, jnp.int32), stages, bool(multipliers))
     return jax.tree.map(known_to_numpy, found)

@@ -11,7 +11,9 @@ from .scene import Scene
 
 def directions_of(scene: Scene, names: tuple[str, ...]) -> Scene:
     """The scene's derivatives by several of its parameters, stacked along a first axis."""
-    return _directions_of(scene, names, np.array([float(scene.parameters[name]) for name in names]))
+    found = _directions_of(scene, names, np.array([float(scene.parameters[name]) for name in names]))
+    # A builder of a structure may make the function of its matrices anew.
+    return jax.tree.unflatten(jax.tree.structure(scene), jax.tree.leaves(found))
 
 
 @by_numpy

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from ..foundation import arguments
 from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision, is_known, real, state_for_pickle, state_from_pickle
+from ..foundation.same_functions import first_like
 from .contact_point import ContactPoint, directions, resolve_contacts
 from .matrix_checks import check_matrix, check_names, check_shapes
 from .own_structures import check_name, remember
@@ -230,7 +231,7 @@ class Structure(eqx.Module):
             raise ValueError(
                 f"Argument `dampers` must name parameters, but has {unknown[0]!r}.{arguments.did_you_mean(unknown[0], numbers)}"
             )
-        source = FromParameters(numbers, tuple(numbers), matrices_of, dampers, builder)
+        source = FromParameters(numbers, tuple(numbers), first_like(matrices_of), dampers, builder)
         try:
             matrices = source.matrices
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.model.directions import directions_of
 from fivjax.model.springs import Springs
 
 # A few products and sums of double-precision numbers; anything wrong in a formula is off by many orders more.
@@ -470,3 +471,22 @@ def test_coordinates_have_names():
     for names in ("abc", [0, 1, 2]):
         with pytest.raises(TypeError, match=r"`coordinates` must be a list of names"):
             fj.Structure(**GOOD, coordinates=names)
+
+
+@pytest.mark.parametrize("fixed", [2.0, np.full((2, 2), 2.0)], ids=["a number", "an array"])
+def test_a_builder_may_make_the_function_of_the_matrices_anew(fixed):
+    """A branch over a parameter of such a structure ended in an error of JAX's, and each value had kernels of its own."""
+
+    def slider(k=1.0):
+        def matrices(k):
+            first = jnp.array([[1.0, 0.0], [0.0, 0.0]])
+            return jnp.eye(2), 0.1 * first, fixed * k * first, jnp.array([0.0, -1.0])
+
+        return fj.Structure.from_parameters(matrices, {"k": k}, tangential=0, normal=1, builder=slider)
+
+    scene = fj.Scene(slider(), fj.Coulomb(0.2), 0.6, fj.ConstantLoad(1.0))
+    kind = jax.tree.structure(scene)
+    assert (jax.tree.structure(scene.replace(k=1.5)) == kind) is isinstance(fixed, float)
+    along = directions_of(scene, ("k",))
+    assert jax.tree.structure(along) == kind
+    np.testing.assert_array_equal(along.structure.stiffness[0], 2 * np.array([[1.0, 0.0], [0.0, 0.0]]))
