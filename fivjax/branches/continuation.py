@@ -86,9 +86,9 @@ def continue_cycle(
       the belt is faster (with several contacts over `contact`, too);
     - `special`: the kind of a special point, else empty: "fold", "non-smooth fold" (no multiplier is one: an impact begins to
       end the slip there, say), "period doubling", "Neimark–Sacker", "amplitude meets the sliding equilibrium", or how the
-      contact modes change there, as seen from the start outwards ("grazing of slip: stick inserted"; with several contacts "…
-      at contact 1", or that two events change their order). "edge of the friction cone": static friction begins or ceases to
-      hold the contact. Special points are computed to rounding;
+      contact modes change there, also where the branch turns back with them, as seen from the start outwards ("grazing of slip:
+      stick inserted"; with several contacts "… at contact 1", or that two events change their order). "edge of the friction
+      cone": static friction begins or ceases to hold the contact. Special points are computed to rounding;
     - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
       points, for the parameter itself, and where the change of modes is not a simple one.
 

@@ -3,6 +3,7 @@
 How often, over a hundred draws of noise in each regime, is measured by `benchmarks.calibration`.
 """
 
+import copy
 from pathlib import Path
 
 import jax
@@ -66,6 +67,17 @@ def test_a_fit_does_not_depend_on_the_unit_of_time(decay, decay_fit):
         assert scale * fit.values[name] == pytest.approx(decay_fit.values[name], rel=1e-9)
         assert scale * fit.uncertainty[name] == pytest.approx(decay_fit.uncertainty[name], rel=1e-6)
     np.testing.assert_allclose(np.array(fit.offsets[0]) / time, decay_fit.offsets[0], rtol=1e-6)
+
+
+def test_an_offset_is_said_to_be_outside_of_its_range_only_if_that_is_certain(decay_fit):
+    """A recording may begin with its kick."""
+    value, error = decay_fit.offsets[0]
+    for beyond, said in ((-1.0, False), (1.0, False), (10.0, True)):
+        fit = copy.copy(decay_fit)
+        at_its_end = copy.copy(fit.recordings[0])
+        object.__setattr__(at_its_end, "offset", (value + beyond * error, value + 1.0))
+        object.__setattr__(fit, "recordings", (at_its_end,))
+        assert ("that was searched" in str(fit)) is said
 
 
 OF_FIRST = ["mu_0", "c1", "k1"]
