@@ -245,9 +245,16 @@ def _selected(which, cases):
     return np.choose(np.asarray(which, int), cases) if len(cases) > 2 else np.where(which, cases[1], cases[0])
 
 
-def _converted(array, kind):
+def _converted(array, kind: np.dtype):
     # NumPy warns where an imaginary part is left out.
-    return (array.real if np.iscomplexobj(array) and kind.kind != "c" else array).astype(kind)
+    array = array.real if np.iscomplexobj(array) and kind.kind != "c" else array
+    if kind.kind in "iu" and np.asarray(array).dtype.kind == "f":
+        # As XLA has it: the nearest number that there is, and zero for none.
+        limits = np.iinfo(kind)
+        beyond, below = array >= float(limits.max), array <= float(limits.min)
+        inside = np.where(beyond | below | np.isnan(array), 0.0, array).astype(kind)
+        return np.where(beyond, limits.max, np.where(below, limits.min, inside)).astype(kind)
+    return array.astype(kind)
 
 
 def _quotient(a, b):

@@ -152,7 +152,8 @@ def without_repeats(value: Value) -> Value:
 
 
 def equal(one, other) -> bool:
-    return type(one) is type(other) and one == other
+    # Zero has a sign.
+    return type(one) is type(other) and one == other and str(one) == str(other)
 
 
 def converted(text: str, own: str, kind: str) -> str:

@@ -206,8 +206,26 @@ def _put_at(writer: Writer, equation, operands, kind: str, how: str) -> Value:
     for at, axis in zip(writer.entries(places).ravel(), numbers.scatter_dims_to_operand_dims, strict=True):
         starts[axis] = np.asarray(at, object)
     kept = [axis for axis in range(len(value.shape)) if axis not in numbers.inserted_window_dims]
+    if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
+        own = dict(zip(kept, update.shape, strict=True))
+        sizes = [own.get(axis, 1) for axis in range(len(value.shape))]
+        update = _dropped_outside(writer, into, starts, sizes, update, kind, how)
     _put(writer, into, starts, update, kept, how)
     return writer.small(into)
+
+
+def _dropped_outside(writer: Writer, into: View, starts, sizes: list[int], update: Value, kind: str, how: str) -> Value:
+    """What is put into a part of an array, where the part is not within it: what is there."""
+    within = _is_within(writer, starts, np.subtract(into.shape, sizes).tolist())
+    if within is True:
+        return update
+    new, there = writer.entries(update), np.full(update.shape, 0, object)
+    if how == "=":
+        there = writer.entries(_from(writer, into, starts, sizes)).reshape(update.shape)
+    found = np.empty(update.shape, object)
+    for place in np.ndindex(found.shape):
+        found[place] = writer.one("select_n", CHOICE, [within, there[place], new[place]], kind)
+    return found
 
 
 def _concatenate(writer: Writer, equation, operands, kind: str) -> Value:

@@ -131,6 +131,19 @@ def test_all_of_it_is_numpy_s_and_agrees_with_jax(function):
             np.testing.assert_allclose(own, other, rtol=1e-13, atol=1e-14)
 
 
+def test_numbers_beyond_all_whole_ones_are_the_nearest_of_them_as_in_jax():
+    """NumPy has the lowest for all of them."""
+    strange = np.array([1.5, -2.5, 3e9, -3e9, 1e300, -1e300, np.inf, -np.inf, np.nan, 2.0**63, -(2.0**63)])
+
+    def whole(x):
+        return [x.astype(kind) for kind in (jnp.int32, jnp.int64, jnp.uint32, jnp.int8)]
+
+    with jax.enable_x64(True):
+        for own, other in zip(by_numpy(whole, always=True)(strange), jax.jit(whole)(strange), strict=True):
+            assert own.dtype == other.dtype
+            np.testing.assert_array_equal(own, other)
+
+
 def test_what_numpy_does_not_have_is_left_to_jax():
     """As a part of the function, which is then no text; and for indices outside of their array."""
     with jax.enable_x64(True):

@@ -398,6 +398,9 @@ def at_the_edges(args, instants):
         "filled": [jnp.take(table, i), table.at[places].get(mode="fill", fill_value=0.5), jnp.take(table, places)],
         "clamped": [table[i], table.at[places].get(mode="clip")],
         "whole": [n // i, n % i, jnp.where(i == 0, n, n // i)],
+        "put": [table.at[i].set(7.0), table.at[i].add(2.0), table.at[i].set(7.0, mode="clip")],
+        "rows": [jnp.outer(table, table).at[i].set(table), jnp.outer(table, table).at[1, i].set(-1.0)],
+        "signs": 1.0 / jnp.where(i > 2, 0.0, -0.0),
     }, ()
 
 
