@@ -4,11 +4,8 @@ import sys
 import threading
 import types
 from collections.abc import Callable
-from typing import TypeVar
 
 from .kept_programs import KNOWN_PACKAGES
-
-F = TypeVar("F", bound=Callable)
 
 # The latest ones, by what is told of them.
 _seen: dict[tuple, Callable] = {}
@@ -16,7 +13,7 @@ MOST = 1000
 _lock = threading.Lock()
 
 
-def first_like(function: F) -> F:
+def first_like(function: Callable[..., tuple]) -> Callable[..., tuple]:
     """The first function seen with the same code that reads the same values; the function itself where that cannot be told.
 
     JAX knows functions by their identity. What is traced of one would be traced again for each that is made anew, and data that
@@ -32,7 +29,7 @@ def first_like(function: F) -> F:
         found = _seen.setdefault(key, function)
         if len(_seen) > MOST:
             del _seen[next(iter(_seen))]
-    return found  # pyright: ignore[reportReturnType]
+    return found
 
 
 class _CannotTell(Exception):
