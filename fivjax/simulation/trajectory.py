@@ -1,5 +1,6 @@
 """One trajectory: `simulate` and its result."""
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -208,8 +209,6 @@ def simulate(
         >>> run.displacement.shape, run.meaning
         ((401, 3), 'reached its end')
     """
-    # The most rows that a trajectory may have: some 20 GB. And the most steps between two of them.
-    most_rows, most_steps = 10**8, 10**9
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
@@ -220,62 +219,24 @@ def simulate(
     arguments.real_number("dt_save", dt_save, above=0)
     arguments.truth("energy", energy)
     arguments.one_of("derivatives", derivatives, MODES)
-    if not method.chooses_its_steps and dt_save < method.dt * (1 - 1e-9):
-        saved, step = apart(dt_save, method.dt)
-        raise ValueError(
-            f"Argument `dt_save` must be at least the method's step, but is {saved} s and `dt` is {step} s. Steps "
-            f"end on saved instants, so no step would be as long as `dt`. Save less often, or lower `dt`."
-        )
     refuse_painleve(scene)
     if not scene.structure.contacts_at_coordinates:
         return _in_contact_coordinates(
             scene, t1, dt_save, method, y0=y0, energy=energy, derivatives=derivatives, progress=progress
         )
-    with np.errstate(over="ignore"):
-        asked = float(np.float64(t1) / np.float64(dt_save))
-    if asked > most_rows:
-        raise ValueError(
-            f"Argument `dt_save` asks for {asked:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
-            f"{most_rows:.0e}. Save less often, or stop earlier."
-        )
-    # The quotient is rounded: by that alone there is no row more.
-    rows = max(math.ceil(asked * (1 - 1e-12) - 1e-9), 1)
+    saved, steps = _saved_instants(method, t1, dt_save)
     start, given = ("sliding equilibrium", None) if y0 is None else ("given by y0", start_state(scene, y0))
-    if dt_save / method.dt > most_steps:
-        raise ValueError(
-            f"Argument `method` has steps of {method.dt:g} s, of which {dt_save / method.dt:.3g} lie between two saved rows; "
-            f"the most is {most_steps:.0e}. Give it a larger `dt`, or lower `dt_save`."
-        )
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
-    steps = math.ceil(dt_save / method.dt - 1e-9)
     most = steps + MOST_ADVANCES
-    # By NumPy, because JAX would compile a small program for each operation.
-    saved = np.append(np.minimum(float(dt_save) * np.arange(rows), float(t1)), float(t1))
-    stepper = with_step_as_array(method)
-    if has_kernel(scene, method):
-        # A kernel finds the equilibrium itself.
-        if given is None:
-            refuse_without_equilibrium(scene)
-        with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
-
-            def follow():
-                return rows_by_kernel(scene, method, given, saved, most, bool(energy))
-
-            # From some milliseconds on.
-            long = len(saved) * max(steps, 1) > 2e4 and is_known(jax.tree.leaves((scene, method, given)))
-            ending, found = interruptible(follow) if long else follow()
-            tick(len(saved) - 1)
-    else:
-        y0 = start_state(scene, None) if given is None else given
-        # Runs with known values are not differentiated.
-        if all(map(is_known, jax.tree.leaves((scene, method, y0)))):
-            with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
-                found = rows_in_parts(scene, stepper, y0, saved, most, bool(energy))
+    # What is traced is not followed yet.
+    known = is_known(jax.tree.leaves((scene, given)))
+    work = following("simulate", shown=progress, total=len(saved) - 1, unit=" rows")
+    with work if known else contextlib.nullcontext():
+        if has_kernel(scene, method):
+            ending, found = _by_kernel(scene, method, given, saved, most, bool(energy), known)
         else:
             modes = None if derivatives == "none" else derivatives
-            found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
-    if "grown" in found:
-        ending = _ending(scene, stepper, found, found.pop("grown"), most, given is None)
+            ending, found = _by_xla(scene, method, given, saved, most, bool(energy), modes)
     if not is_known(found["velocity"]):
         found = _without_derivatives_unless_begun(found)
     settings = (
@@ -286,6 +247,68 @@ def simulate(
         ("start", start),
     )
     return Trajectory(**found, scene=scene, outcome=ending.astype(np.int8), settings=settings)
+
+
+def _saved_instants(method: AbstractStepper, t1: float, dt_save: float) -> tuple[Float[np.ndarray, " T"], int]:
+    """The saved instants (s), and how many steps of `dt` there are between two of them.
+
+    **Raises:** `ValueError` for more of either than is possible.
+    """
+    # The most rows that a trajectory may have: some 20 GB. And the most steps between two of them.
+    most_rows, most_steps = 10**8, 10**9
+    if not method.chooses_its_steps and dt_save < method.dt * (1 - 1e-9):
+        saved, step = apart(dt_save, method.dt)
+        raise ValueError(
+            f"Argument `dt_save` must be at least the method's step, but is {saved} s and `dt` is {step} s. Steps "
+            f"end on saved instants, so no step would be as long as `dt`. Save less often, or lower `dt`."
+        )
+    with np.errstate(over="ignore"):
+        rows, steps = float(np.float64(t1) / np.float64(dt_save)), float(np.float64(dt_save) / np.float64(method.dt))
+    if rows > most_rows:
+        raise ValueError(
+            f"Argument `dt_save` asks for {rows:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
+            f"{most_rows:.0e}. Save less often, or stop earlier."
+        )
+    if steps > most_steps:
+        raise ValueError(
+            f"Argument `method` has steps of {method.dt:g} s, of which {steps:.3g} lie between two saved rows; the most is "
+            f"{most_steps:.0e}. Give it a larger `dt`, or lower `dt_save`."
+        )
+    # The quotient is rounded: by that alone there is no row more.
+    whole = max(math.ceil(rows * (1 - 1e-12) - 1e-9), 1)
+    # By NumPy, because JAX would compile a small program for each operation.
+    saved = np.append(np.minimum(float(dt_save) * np.arange(whole), float(t1)), float(t1))
+    return saved, math.ceil(steps - 1e-9)
+
+
+def _by_kernel(
+    scene: Scene, method, given: State | None, saved, most: int, energy: bool, known: bool
+) -> tuple[Array | np.int8, dict]:
+    """How the motion ended, and its rows; from the equilibrium unless a start is `given`."""
+    if given is None:
+        refuse_without_equilibrium(scene)
+
+    def follow():
+        return rows_by_kernel(scene, method, given, saved, most, energy)
+
+    # It takes some milliseconds and more.
+    long = len(saved) * max(most - MOST_ADVANCES, 1) > 2e4
+    followed = interruptible(follow) if long and known else follow()
+    tick(len(saved) - 1)
+    return followed
+
+
+def _by_xla(
+    scene: Scene, method, given: State | None, saved, most: int, energy: bool, derivatives: str | None
+) -> tuple[Array | np.int8, dict]:
+    """The same without a kernel."""
+    stepper, y0 = with_step_as_array(method), start_state(scene, None) if given is None else given
+    # Runs with known values are not differentiated.
+    if all(map(is_known, jax.tree.leaves((scene, method, y0)))):
+        found = rows_in_parts(scene, stepper, y0, saved, most, energy)
+    else:
+        found = rows_at(scene, stepper, y0, saved, most, energy, derivatives)
+    return _ending(scene, stepper, found, found.pop("grown"), most, given is None), found
 
 
 def _without_derivatives_unless_begun(rows: dict) -> dict:
