@@ -62,16 +62,20 @@ def transition(
     y: State,
     ended: Bool[Array, "*contacts 2"],
     resolution: Float[Array, ""],
+    lifts_rest: bool = False,
 ) -> tuple[Contact, State]:
     """The next mode where the guards in `ended` are used up, and the state on its constraint.
 
     Without any such guard, nothing changes. A rebound that would be back on the belt within the time `resolution` (s) counts as
-    rest: with restitution, bounces get shorter without end, and a stepper can follow only so many.
+    rest: with restitution, bounces get shorter without end, and a stepper can follow only so many. With `lifts_rest` so does
+    what the impact of another contact lifts off, which a stepper that finds no events could let go on for ever.
     """
+
+    def following() -> tuple[Contact, State]:
+        return _following(mechanics, contact, load, y, ended, resolution, lifts_rest)
+
     # Costly, and seldom needed.
-    return jax.lax.cond(
-        jnp.any(ended), lambda: _following(mechanics, contact, load, y, ended, resolution), lambda: (contact, y)
-    )
+    return jax.lax.cond(jnp.any(ended), following, lambda: (contact, y))
 
 
 def stopped(mechanics: Mechanics, contact: Contact, y: State, ended: Bool[Array, "*contacts 2"]) -> State:
@@ -95,12 +99,13 @@ def _following(
     y: State,
     ended: Bool[Array, "*contacts 2"],
     resolution: Float[Array, ""],
+    lifts_rest: bool,
 ) -> tuple[Contact, State]:
     touched = _has_touched(contact, ended)
     y_stopped = stopped(mechanics, contact, y, ended)
 
     def struck() -> State:
-        return _struck(mechanics, contact, load, y_stopped, touched, resolution)
+        return _struck(mechanics, contact, load, y_stopped, touched, resolution, lifts_rest)
 
     # Where no force is in a contact yet that stuck, the edge of the cone that has ended says where it is pushed.
     edge = jnp.where((contact.status == Status.STICK) & ended[..., 1], -1.0, 1.0).astype(y.dtype)
@@ -135,6 +140,7 @@ def _struck(
     y: State,
     touched: Bool[Array, "*contacts"],
     resolution: Float[Array, ""],
+    lifts_rest: bool,
 ) -> State:
     """The state after the impacts of the contacts that have `touched`."""
     fall, rate = _fall(mechanics, contact, load, y), gap_rate(mechanics, y)
@@ -151,8 +157,7 @@ def _struck(
         y_struck = jnp.where(rising, y, impact(mechanics, y))
     own = gap_rate(mechanics, y_struck)
     rests = rising | (touched & _ends_within(resolution, own, fall))
-    if mechanics.several:
-        # An impact elsewhere may lift one off that is on the belt, and would be back at once.
+    if mechanics.several and lifts_rest:
         lifted = reached & (contact.status != Status.DETACH) & (own > 0)
         free = Contact(jnp.where(lifted, Status.DETACH, contact.status), contact.direction)
         rests = rests | (lifted & _ends_within(resolution, own, _fall(mechanics, free, load, y)))

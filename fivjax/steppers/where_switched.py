@@ -117,7 +117,7 @@ class WhereSwitched(AbstractStepper):
         # steps going for ever.
         e = jnp.max(mechanics.restitution) if mechanics.several else mechanics.restitution
         resolution = h * jnp.clip(2 * e / jnp.maximum(1 - e, 0.01), 2.0, 200.0)
-        next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, resolution)
+        next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, resolution, lifts_rest=True)
         return y, next_contact, ended
 
 
