@@ -213,3 +213,16 @@ def of_known(equation, operands: list[Value]) -> list[Value]:
         for part, atom in zip(operands, equation.invars, strict=True)
     ]
     return list(map(of_numbers, function_of(equation)(values)))
+
+
+def fill_of(equation):
+    """The number that JAX gives for places outside of an array."""
+    value, dtype = equation.params["fill_value"], equation.outvars[0].aval.dtype
+    if value is not None:
+        return dtype.type(value).item()
+    if np.issubdtype(dtype, np.floating):
+        return float("nan")
+    if np.issubdtype(dtype, np.bool_):
+        return True
+    limits = np.iinfo(dtype)
+    return int(limits.min if limits.min < 0 else limits.max)

@@ -8,7 +8,7 @@ from jax.lax import GatherScatterMode
 from ..foundation.numpy_primitives import gathered_places, scattered_places
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers, reshaped
 from .cpp_lanes import KINDS, OF_LANES, TRUTHS, WHOLES
-from .cpp_numbers import BY_NUMBER, kind_of
+from .cpp_numbers import BY_NUMBER, fill_of, kind_of
 from .cpp_writer import FEW, Writer
 
 CHOICE = "({0} ? {2} : {1})"
@@ -84,10 +84,8 @@ def _address(part: View, at: str, place) -> str:
 
 def _put(writer: Writer, into: View, starts, update, axes, how: str) -> None:
     """Numbers into the part of an array from these places on, along these axes."""
-    sizes, kind = update.shape, into.kind
-    if axes is not None:
-        sizes = [update.shape[axes.index(axis)] if axis in axes else 1 for axis in range(into.ndim)]
-    part, at = _part(writer, into, starts, sizes)
+    kind = into.kind
+    part, at = _part(writer, into, starts, update.shape if axes is None else _sizes(into, update, axes))
     part = part if axes is None else part.selected(part.offset, axes)
     for place, entry in np.ndenumerate(writer.entries(update)):
         own = writer.as_type(entry, kind)
@@ -95,6 +93,10 @@ def _put(writer: Writer, into: View, starts, update, axes, how: str) -> None:
             writer.put(f"{part.at(place)} {how} {own};")
         else:
             writer.put(f"{'put' if how == '=' else 'add'}({part.base}, {_address(part, at, place)}, {own});")
+
+
+def _sizes(into: View, update: Value, axes: list[int]) -> list[int]:
+    return [update.shape[axes.index(axis)] if axis in axes else 1 for axis in range(into.ndim)]
 
 
 def _dynamic_update_slice(writer: Writer, equation, operands, kind: str) -> Value:
@@ -126,7 +128,7 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
     found = np.empty(equation.outvars[0].aval.shape, object)
     parts, within, fill = {}, {}, None
     if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
-        fill = _fill_of(equation)
+        fill = fill_of(equation)
     for batch in np.ndindex(places.shape[:-1]):
         starts = [of_numbers(0)] * view.ndim
         for axis, of_batch in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
@@ -159,19 +161,6 @@ def _is_within(writer: Writer, starts, most: list[int]):
             elif not (entry >= end if name == "ge" else entry <= end):
                 return False
     return held
-
-
-def _fill_of(equation):
-    """The number that JAX gives for places outside of an array."""
-    value, dtype = equation.params["fill_value"], equation.outvars[0].aval.dtype
-    if value is not None:
-        return dtype.type(value).item()
-    if np.issubdtype(dtype, np.floating):
-        return float("nan")
-    if np.issubdtype(dtype, np.bool_):
-        return True
-    limits = np.iinfo(dtype)
-    return int(limits.min if limits.min < 0 else limits.max)
 
 
 def _scatter(writer: Writer, equation, operands, kind: str) -> Value:
@@ -207,9 +196,7 @@ def _put_at(writer: Writer, equation, operands, kind: str, how: str) -> Value:
         starts[axis] = np.asarray(at, object)
     kept = [axis for axis in range(len(value.shape)) if axis not in numbers.inserted_window_dims]
     if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
-        own = dict(zip(kept, update.shape, strict=True))
-        sizes = [own.get(axis, 1) for axis in range(len(value.shape))]
-        update = _dropped_outside(writer, into, starts, sizes, update, kind, how)
+        update = _dropped_outside(writer, into, starts, _sizes(into, update, kept), update, kind, how)
     _put(writer, into, starts, update, kept, how)
     return writer.small(into)
 
@@ -219,12 +206,11 @@ def _dropped_outside(writer: Writer, into: View, starts, sizes: list[int], updat
     within = _is_within(writer, starts, np.subtract(into.shape, sizes).tolist())
     if within is True:
         return update
-    new, there = writer.entries(update), np.full(update.shape, 0, object)
+    found, there = writer.entries(update).copy(), np.full(update.shape, 0, object)
     if how == "=":
         there = writer.entries(_from(writer, into, starts, sizes)).reshape(update.shape)
-    found = np.empty(update.shape, object)
-    for place in np.ndindex(found.shape):
-        found[place] = writer.one("select_n", CHOICE, [within, there[place], new[place]], kind)
+    for place, new in np.ndenumerate(found):
+        found[place] = writer.one("select_n", CHOICE, [within, there[place], new], kind)
     return found
 
 
