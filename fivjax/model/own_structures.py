@@ -6,11 +6,13 @@ import threading
 from collections.abc import Callable, Hashable
 from typing import Any
 
-# Arguments of functions that take parameters by their names beside these: maps, critical kicks, charts and curves of modes.
+# Arguments of functions that take parameters by their names beside these: maps and parts of them, critical kicks, charts and
+# curves of modes.
 ARGUMENTS = frozenset(
     {
         *("self", "scene", "system", "direction", "method", "t_max", "memory", "max_steps", "progress", "resume"),
         *("energy", "refine", "sparse", "audit", "executor", "kick", "p_range", "p_step", "tolerance", "derivatives"),
+        *("points", "most"),
     }
 )
 # A function of a structure's parameters by name.

@@ -447,7 +447,7 @@ def test_a_contact_of_one_direction(normal):
 
 def test_no_parameter_is_called_like_an_argument_of_what_takes_parameters_by_their_names():
     """It would be taken for that argument."""
-    functions = fj.bistability_map, fj.basins, fj.critical_perturbation, fj.cea.chart, fj.cea.modes
+    functions = fj.bistability_map, fj.basins, fj.critical_perturbation, fj.cea.chart, fj.cea.modes, fj.window
     kinds = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
     taken = {name for one in functions for name, at in inspect.signature(one).parameters.items() if at.kind in kinds}
     assert taken | {"self"} == ARGUMENTS
