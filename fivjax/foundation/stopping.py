@@ -52,7 +52,7 @@ def stop_requests() -> Iterator[list[int]]:
 
 def interruptible(call: Callable[[], R]) -> R:
     """The result of a call that is inside compiled code for long. It runs in a thread, which a signal leaves behind at once: it
-    goes on for nobody until it ends, or the process does.
+    goes on for nobody until it ends, or the process does. Of JAX's settings by context it has `own_settings` only.
     """
     if threading.current_thread() is not threading.main_thread():
         return call()

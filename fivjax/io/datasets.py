@@ -90,7 +90,10 @@ def check_axis_names(axes: Iterable[str], results: Collection[str], of: str) -> 
 
 
 # Attributes of a variable by which readers of files, xarray among them, change its values; and a unit that makes dates of them.
-CHANGING, DATES = ("scale_factor", "add_offset", "_FillValue", "missing_value", "dtype", "_Unsigned"), " since "
+CHANGING, DATES = (
+    ("scale_factor", "add_offset", "_FillValue", "missing_value", "dtype", "_Unsigned", "_Encoding"),
+    " since ",
+)
 # Suffixes of what `save` does not write.
 OTHERS = (".csv", ".txt", ".zarr", ".npz", ".npy", ".mat", ".xlsx", ".json", ".parquet", ".png", ".pdf", ".svg")
 

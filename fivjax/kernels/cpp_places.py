@@ -195,6 +195,9 @@ def _put_at(writer: Writer, equation, operands, kind: str, how: str) -> Value:
     for at, axis in zip(writer.entries(places).ravel(), numbers.scatter_dims_to_operand_dims, strict=True):
         starts[axis] = np.asarray(at, object)
     kept = [axis for axis in range(len(value.shape)) if axis not in numbers.inserted_window_dims]
+    window = [update.shape[axis] for axis in numbers.update_window_dims]
+    if len(window) != len(update.shape):
+        update = writer.entries(update).reshape(window)
     if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
         update = _dropped_outside(writer, into, starts, _sizes(into, update, kept), update, kind, how)
     _put(writer, into, starts, update, kept, how)

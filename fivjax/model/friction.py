@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..foundation import arguments
 from ..foundation.digits import apart
@@ -22,6 +22,12 @@ from ..foundation.smoothness import is_smooth
 from ..foundation.taylor import composed, taylor_coefficients
 from .printing import as_call
 
+# What JAX raises where the number of something traced is asked for.
+NEEDS_NUMBERS = (
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+    jax.errors.ConcretizationTypeError,
+)
 # Gives the next Taylor coefficient in time of μ, from those of the slip speed up to the same order and from those of μ so far.
 NextTerm = Callable[[list[Array], list[Array]], Array]
 
@@ -37,8 +43,8 @@ class AbstractFriction(eqx.Module):
       Unless defined, nothing is known, and such verdicts stay undecided.
     - `constant` says that μ never changes.
     - `smooth` says whether μ has no kinks, at speeds above zero. Unless said, that is read from the code: a law that compares,
-      clips, takes from a table or takes a root of what may be zero may have some. Then a bound on $|μ''|$ is worth nothing and
-      is not used.
+      clips, takes from a table, or takes a root or the inverse of what may be zero may have some. Then a bound on $|μ''|$ is
+      worth nothing and is not used.
 
     A scene checks this where values are known, at slip speeds from 0 to ten times the belt's, and holds the law's numbers in
     double precision. Fields are the law's parameters; what `replace` and maps change must be a field that the constructor takes
@@ -73,17 +79,17 @@ class AbstractFriction(eqx.Module):
         return unknown, unknown
 
     @property
-    def may_have_kinks(self) -> bool:
-        """Whether the law is not certain to be smooth."""
+    def may_have_kinks(self) -> Bool[Array, ""] | np.bool_:
+        """Whether the law is not certain to be smooth; traced, if that depends on parameters that are."""
         if self.smooth is not None:
-            return not self.smooth
+            return np.bool_(not self.smooth)
         with jax.enable_x64(True):
-            return not is_smooth(self, jnp.zeros(()))
+            return ~is_smooth(self, jnp.zeros(()))
 
     def bounds(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """`variation` as far as proofs may rely on it: without a bound on |μ''| where the law may have kinks."""
         slope, bend = self.variation(slip_speed)
-        return slope, jnp.full_like(bend, jnp.inf) if self.may_have_kinks else bend
+        return slope, jnp.where(self.may_have_kinks, jnp.inf, bend)
 
     def largest(self, fastest: Float[Array, "*contacts"]) -> Float[Array, "*contacts"]:
         """The largest coefficient from rest to each of these slip speeds (m/s), as far as looking at some speeds shows."""
@@ -158,7 +164,7 @@ class AbstractFriction(eqx.Module):
             speed = jax.ShapeDtypeStruct((), np.dtype("float64"))
             try:
                 traced, found = jax.make_jaxpr(lambda speed: self(speed), return_shape=True)(speed)
-            except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+            except NEEDS_NUMBERS as error:
                 raise TypeError(
                     f"The friction law `{name}` must be a JAX function, but asks for a value while it is traced. "
                     f"Use `jax.numpy` in place of NumPy, and `jnp.where` in place of `if`. {more}"
@@ -199,7 +205,7 @@ def rebuilt(part, changes: Mapping):
     own = {name: value for name, value in vars(part).items() if value is not None}
     try:
         return type(part)(**{name: changes.get(name, value) for name, value in own.items()})
-    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+    except NEEDS_NUMBERS as error:
         raise TypeError(
             f"The constructor of `{type(part).__name__}` must take what JAX traces, but asks for a number, as `float(…)` and "
             f"`if` do. Keep what it is given by `jnp.asarray`, and leave checks of values to where these are known."

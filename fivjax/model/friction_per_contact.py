@@ -1,10 +1,13 @@
 """Friction laws of several contacts, one for each."""
 
+import functools
+import operator
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from ..foundation import arguments
 from .friction import AbstractFriction, NextTerm, numeric_fields, rebuilt
@@ -50,8 +53,8 @@ class FrictionPerContact(AbstractFriction):
         return FrictionPerContact(laws)
 
     @property
-    def may_have_kinks(self) -> bool:
-        return any(law.may_have_kinks for law in self.laws)
+    def may_have_kinks(self) -> Bool[Array, ""] | np.bool_:
+        return functools.reduce(operator.or_, (law.may_have_kinks for law in self.laws))
 
     def check(self, belt_speed: Array | float = 0.0) -> None:
         for law in self.laws:

@@ -165,7 +165,7 @@ def describe_method(method: AbstractStepper) -> str:
         usual = parameter.default
         # diffrax has a method `order`.
         own = getattr(method, f"{name}_", getattr(method, name, usual))
-        if name != "dt" and isinstance(usual, int | float) and own != usual:
+        if name != "dt" and isinstance(usual, int | float) and isinstance(own, int | float) and own != usual:
             said.append(f"{name}={own}")
     said = [*([] if inner is None else [type(inner).__name__]), *said, f"dt={method.dt:g}"]
     return f"{type(method).__name__}({', '.join(said)})"

@@ -206,8 +206,8 @@ def why_withheld(scene: Scene) -> str | None:
         if law.may_have_kinks:
             return (
                 f"No motion is proved to slide for ever: the friction law `{name}` may have kinks (it compares, clips, takes "
-                f"from a table or takes a root of what may be zero), and the proof needs a bound on its second derivative. If "
-                f"it has none, say so: `smooth = True`."
+                f"from a table, or takes a root or the inverse of what may be zero), and the proof needs a bound on its second "
+                f"derivative. If it has none, say so: `smooth = True`."
             )
         bounds = [float(bound) for bound in law.variation(jnp.asarray(LOWEST_SLIP * speed))]
         if not np.all(np.isfinite(bounds)):

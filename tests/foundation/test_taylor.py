@@ -22,6 +22,9 @@ LAWS = {
     "a size by a root": (lambda x: x + jnp.sqrt((x - 0.1) * (x - 0.1)), False),
     "a size by a power": (lambda x: x + ((x - 0.1) ** 2) ** 0.5, False),
     "a size by an angle": (lambda x: x + jnp.arccos(jnp.cos(x)), False),
+    "a size by a logarithm": (lambda x: x + jnp.exp(0.5 * jnp.log((x - 0.1) ** 2)), False),
+    "a jump by an inverse": (lambda x: jnp.tanh(1 / (x - 0.9)), False),
+    "a jump by a negative power": (lambda x: jnp.arctan((x - 0.9) ** -1), False),
     "a jump by an angle": (lambda x: jnp.arctan(jnp.tan(x)), False),
     "a loop": (lambda x: jax.lax.fori_loop(0, 5, lambda i, y: y * x + 2.0, jnp.ones_like(x)), True),
     "a branch": (lambda x: jax.lax.cond(x > 2, jnp.sin, jnp.exp, x), False),
@@ -41,7 +44,19 @@ def test_the_series_is_the_law_and_smoothness_is_read_from_its_code(law, smooth)
         c = np.array(taylor_coefficients(law, jnp.asarray(AT), ORDER))
         beside = 0.25 * RADIUS
         assert np.polyval(c[::-1], beside) == pytest.approx(float(law(jnp.asarray(AT + beside))), rel=1e-14)
-        assert is_smooth(law, jnp.asarray(AT)) is smooth
+        assert bool(is_smooth(law, jnp.asarray(AT))) is smooth
+
+
+def test_smoothness_may_depend_on_parameters_that_are_traced():
+    """Rejects taking their signs for unknown: proofs were lost in compiled code only."""
+
+    def smooth(scale, power):
+        return is_smooth(lambda x: (1 + x / scale) ** power + 1 / (x + scale), jnp.asarray(AT))
+
+    with jax.enable_x64(True):
+        for scale, expected in ((2.0, True), (-2.0, False)):
+            assert bool(smooth(jnp.asarray(scale), jnp.asarray(-1.3))) is expected
+            assert bool(jax.jit(smooth)(scale, -1.3)) is expected
 
 
 def test_complex_numbers_are_refused():

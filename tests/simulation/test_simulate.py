@@ -431,6 +431,8 @@ def test_a_long_run_obeys_ctrl_c(paper_scene, monkeypatch):
     inside, ends = threading.Event(), threading.Event()
 
     def compiled_code(*_):
+        # The main thread could not handle a signal in here.
+        assert threading.current_thread() is not threading.main_thread()
         inside.set()
         ends.wait(60)
 
