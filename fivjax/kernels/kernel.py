@@ -16,7 +16,7 @@ from .c_functions import compiler
 from .code import source_from_plain, traced_source
 from .cpp_lanes import declarations
 from .lane_functions import AT_A_TIME, LaneFunction
-from .tiered import QUICKLY, SOMEWHAT
+from .tiered import QUICKLY, SOMEWHAT, THOROUGHLY
 from .warp_library import gpus_for, warp
 from .xla_calls import Addresses
 
@@ -30,6 +30,8 @@ SIZES = ("numbers", "step", "count")
 OF_GROUPS = ("shared", "groups")
 _SHARED = "const double* shared = (const double*)shared_ + (long long)each_ * ((const int*)groups_)[lane];\n"
 _NO_DOTS = np.zeros((1, 1, 1))
+# So many characters of code, and more, are compiled quickly first where it would be thoroughly at once.
+LONG = 300_000
 
 
 class Groups(NamedTuple):
@@ -83,6 +85,8 @@ class Kernel:
         names = [f"{name}_" for name in places], [f"{name}_" for name in sizes]
         # Where values are asked for again and again, derivatives are asked for now and then.
         level = QUICKLY if width and function.level == SOMEWHAT else function.level
+        # What is long, as with several contacts, takes longer to compile thoroughly than most programs run it.
+        level = QUICKLY if level == THOROUGHLY and len(body) > LONG else level
         # What processors hold in one register or two counts as a number, not as a vector.
         level = max(level, SOMEWHAT) if lanes > 1 or width > 8 else level
         self.of_lanes = LaneFunction(body, *names, lanes, before, level)
