@@ -22,7 +22,7 @@ STABLE, GROWTH = 4.0, 0.01
 class Line:
     """A return map of which one coordinate is free, in place of `ReturnMaps`: away from an unstable cycle, to a stable one."""
 
-    weights, known_to, normal, sliding = np.ones(4), 1e-6, 1, np.ones(1)
+    weights, known_to, normal = np.ones(4), 1e-6, 1
     structure, section = SimpleNamespace(size=2, contacts=[None]), np.array([1.0, 0.0])
 
     def __init__(self, unstable):
@@ -40,6 +40,9 @@ class Line:
         nothing = np.zeros(len(group))
         none = nothing.astype(np.int32)
         return Images(at._replace(y=y), none, none, nothing, path, nothing)
+
+    def with_modes(self, group, y):
+        return Section(y, np.ones(len(y), np.int32), np.ones(len(y)))
 
     def path(self, group, at, count):
         found = self.returns(group, at, count, count)

@@ -512,7 +512,7 @@ def test_the_smooth_mean_of_a_quasi_periodic_sequence_is_its_mean(start):
 class Locked:
     """A return map of a circle that is locked to 5 turns in 13 returns, where neighbours close in by a thousandth a return."""
 
-    weights, tangential, normal, sliding = np.ones(6), 0, 2, np.ones(1)
+    weights, tangential, normal = np.ones(6), 0, 2
     structure = SimpleNamespace(contacts=[None])
 
     def once(self, y):
@@ -547,6 +547,9 @@ class Locked:
             ahead, behind = (self.returns(group, at._replace(y=at.y + sign * away), crossings).at.y for sign in (1, -1))
             slopes[:, :, place] = (ahead - behind) / 2e-6
         return images.at, images.time, slopes
+
+    def with_modes(self, group, y):
+        return Section(y, np.ones(len(y), np.int32), np.ones(len(y)))
 
     def moves(self, group, y):
         return np.ones(len(group), bool)

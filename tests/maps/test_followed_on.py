@@ -34,7 +34,7 @@ def law(x):
 class Line:
     """A return map of which one coordinate is free, in place of `ReturnMaps`; one event per return beyond 2, none before."""
 
-    weights, known_to, tangential, normal, sliding = np.ones(4), 1e-6, 0, 1, np.ones(2)
+    weights, known_to, tangential, normal = np.ones(4), 1e-6, 0, 1
     resolution = np.zeros(2)
     structure, section = types.SimpleNamespace(size=2, contacts=[None]), np.array([1.0, 0.0])
 
@@ -49,6 +49,9 @@ class Line:
             path[going] = np.concatenate([path[going, 1:], y[going, None]], axis=1)
         y = np.stack([x, *np.zeros((3, len(x)))], axis=1)
         return Images(Section(y, at.status, at.direction), events, events, RETURN * crossings, path, x)
+
+    def with_modes(self, group, y):
+        return Section(y, np.ones(len(y), np.int32), np.ones(len(y)))
 
     def moves(self, group, y):
         return y[:, 0] != 0
