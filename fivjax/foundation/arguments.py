@@ -16,6 +16,12 @@ from .precision import is_known
 
 # Energies are products of two or three numbers that users give; they must be finite, too.
 LARGEST = 1e100
+# What JAX raises where the number of something traced is asked for.
+NEEDS_NUMBERS = (
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+    jax.errors.ConcretizationTypeError,
+)
 
 
 def real_number(

@@ -248,7 +248,7 @@ def _selected(which, cases):
 def _converted(array, kind: np.dtype):
     # NumPy warns where an imaginary part is left out.
     array = array.real if np.iscomplexobj(array) and kind.kind != "c" else array
-    if kind.kind in "iu" and np.asarray(array).dtype.kind == "f":
+    if kind.kind in "iu" and array.dtype.kind == "f":
         # As XLA has it: the nearest number that there is, and zero for none.
         limits = np.iinfo(kind)
         beyond, below = array >= float(limits.max), array <= float(limits.min)

@@ -24,20 +24,27 @@ def first_like(function: Callable[..., tuple]) -> Callable[..., tuple]:
     JAX knows functions by their identity. What is traced of one would be traced again for each that is made anew, and data that
     hold different ones do not go together.
     """
+    told = _told_now(function)
+    if told is None:
+        return function
+    with _lock:
+        found = _seen.get(told)
+        # What functions of one loop read may change after they are made.
+        if found is None or _told_now(found) != told:
+            found = _seen[told] = function
+        if len(_seen) > MOST:
+            del _seen[next(iter(_seen))]
+    return found
+
+
+def _told_now(function: Callable) -> tuple | None:
+    """What tells a function from others at this moment; None where that cannot be told."""
     if type(function) is not types.FunctionType:
-        return function
+        return None
     try:
-        told = _told(function, {})
-        with _lock:
-            found = _seen.get(told)
-            # What functions of one loop read may change after they are made.
-            if found is None or _told(found, {}) != told:
-                found = _seen[told] = function
-            if len(_seen) > MOST:
-                del _seen[next(iter(_seen))]
-        return found
+        return _told(function, {})
     except _CannotTell:
-        return function
+        return None
 
 
 class _CannotTell(Exception):

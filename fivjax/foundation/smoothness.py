@@ -24,8 +24,8 @@ SMOOTH = frozenset({
 COMPARISONS = frozenset({"eq", "ne", "lt", "le", "gt", "ge", "is_finite", "and", "or", "not", "xor"})
 # Where all operands are above zero, or none is below, so is the result.
 KEEPING = frozenset({
-    "add", "add_any", "mul", "div", "square", "integer_pow", "pow", "sqrt", "rsqrt", "cbrt", "abs", "expm1", "log1p",
-    "atan", "sinh", "tanh", "asinh", "erf", "reduce_sum", "copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze",
+    "add", "add_any", "mul", "div", "square", "integer_pow", "sqrt", "rsqrt", "cbrt", "abs", "expm1", "log1p", "atan",
+    "sinh", "tanh", "asinh", "erf", "reduce_sum", "copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze",
     "expand_dims", "slice", "concatenate", "stack", "transpose", "rev", "convert_element_type",
     "optimization_barrier", "device_put",
 })
@@ -43,9 +43,13 @@ class _Value(NamedTuple):
     """What is known of a number in a function, for all its arguments: of numbers that are traced, as traced truths."""
 
     moves: bool  # whether it depends on the arguments
-    above: Truth = NO  # whether it is above zero
-    not_below: Truth = NO
-    passes: Truth = YES  # whether it may pass zero when the arguments move
+    above: Truth  # whether it is above zero
+    not_below: Truth
+    passes: Truth  # whether it may pass zero when the arguments move
+
+
+def _unknown(moves: bool) -> _Value:
+    return _Value(moves, NO, NO, np.bool_(moves))
 
 
 def is_smooth(function: Callable, *like) -> Truth:
@@ -63,7 +67,7 @@ def is_smooth(function: Callable, *like) -> Truth:
 def _fixed(number) -> _Value:
     """A number that does not move."""
     if not np.size(number) or not jnp.issubdtype(jnp.result_type(number), jnp.floating):
-        return _Value(False, passes=NO)
+        return _unknown(False)
     lowest = np.min(np.asarray(number)) if is_known(number) else jnp.min(number)
     return _Value(False, lowest > 0, lowest >= 0, NO)
 
@@ -74,16 +78,16 @@ def _smooth(jaxpr: Jaxpr, values: Sequence[_Value], constants: Sequence[_Value] 
     known.update(zip(jaxpr.constvars, constants, strict=False))
 
     def read(atom) -> _Value:
-        return _fixed(atom.val) if isinstance(atom, Literal) else known.get(atom, _Value(False, passes=NO))
+        return _fixed(atom.val) if isinstance(atom, Literal) else known.get(atom, _unknown(False))
 
     smooth = YES
     for equation in jaxpr.eqns:
         operands, name = list(map(read, equation.invars)), equation.primitive.name
         moves, called = any(one.moves for one in operands), within(equation.params)
-        ends = [_Value(moves, passes=np.bool_(moves))] * len(equation.outvars)
+        ends = [_unknown(moves)] * len(equation.outvars)
         if moves and name in ("scan", "while"):
             flags, own = _looped(equation.params, [one.moves for one in operands])
-            ends, smooth = [_Value(flag, passes=np.bool_(flag)) for flag in flags], smooth & own
+            ends, smooth = list(map(_unknown, flags)), smooth & own
         elif moves and name == "cond" and not operands[0].moves:
             for branch in equation.params["branches"]:
                 smooth = smooth & _smooth(branch.jaxpr, operands[1:])[1]
@@ -169,5 +173,5 @@ def _looped(params, flags: list[bool]) -> tuple[list[bool], Truth]:
 
 def _moving(jaxpr: Jaxpr, flags: list[bool]) -> tuple[list[bool], Truth]:
     """Which results of a loop's turn move, where these operands do, and whether all that happens to them is smooth."""
-    ends, smooth = _smooth(jaxpr, [_Value(flag, passes=np.bool_(flag)) for flag in flags])
+    ends, smooth = _smooth(jaxpr, list(map(_unknown, flags)))
     return [one.moves for one in ends], smooth

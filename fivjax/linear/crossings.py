@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Complex, Float
 
 from ..foundation.linear_solve import inverse, solve
 from ..foundation.matrix_routines import eigenvalues
@@ -38,10 +38,9 @@ class _StateSpace(NamedTuple):
     stiffness: Float[Array, "m m"]
     damping: Float[Array, "m m"]
     column: Float[Array, " m"]
-    # Of displacements and velocities, in what the loop feeds back; of the input itself, at once.
+    # Of displacements and velocities, in what the loop feeds back.
     row_position: Float[Array, " m"]
     row_velocity: Float[Array, " m"]
-    impulsive: Float[Array, ""]
 
     @classmethod
     def of(cls, loop: Loop) -> "_StateSpace":
@@ -50,7 +49,7 @@ class _StateSpace(NamedTuple):
         stiffness, damping, column = solved[:, :m], solved[:, m : 2 * m], solved[:, 2 * m]
         row_position = loop.row_stiffness - loop.row_mass @ stiffness
         row_velocity = loop.row_damping - loop.row_mass @ damping
-        return cls(stiffness, damping, column, row_position, row_velocity, loop.limits[1])
+        return cls(stiffness, damping, column, row_position, row_velocity)
 
     @property
     def matrix(self) -> Float[Array, "2m 2m"]:
@@ -66,22 +65,21 @@ class _StateSpace(NamedTuple):
     def row(self) -> Float[Array, " 2m"]:
         return jnp.concatenate([self.row_position, self.row_velocity])
 
-    def is_unstable(self, gain: Float[Array, ""]) -> Bool[Array, ""]:
-        """Whether the closed loop grows at this gain."""
-        closed = self.matrix + jnp.outer(self.input, self.row) * gain / (1 - gain * self.impulsive)
-        return significant_growth(in_natural_units(closed, 1.0)) > 0
-
 
 @jax.custom_jvp
 def first_limit(loop: Loop) -> Limit:
     """The smallest gain just above which the loop is unstable, found by checking every crossing."""
-    system = _StateSpace.of(loop)
+    system, (static, impulsive) = _StateSpace.of(loop), loop.limits
+    state, input_, row = system.matrix, system.input, system.row
     inverse_gain, omega, codes = _crossings(loop, system)
-    typical = 1 / (jnp.abs(system.impulsive) + jnp.linalg.norm(system.row) * jnp.linalg.norm(system.column))
+    inverse_gain = jnp.concatenate([inverse_gain, jnp.stack([static, impulsive])])
+    omega = jnp.concatenate([omega, jnp.array([0.0, jnp.inf])])
+    codes = jnp.array([*codes, DIVERGENCE, PAINLEVE], jnp.int32)
+    typical = 1 / (jnp.abs(impulsive) + jnp.linalg.norm(row) * jnp.linalg.norm(system.column))
     typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
     usable = jnp.isfinite(inverse_gain) & (inverse_gain > 0)
     # A mode without damping lies on the imaginary axis already at gain zero, which is no crossing.
-    values = eigenvalues(in_natural_units(system.matrix, 1.0))
+    values = eigenvalues(in_natural_units(state, 1.0))
     marginal = jnp.any(values.real > -1e-11 * jnp.abs(values))
     usable = usable & ~(marginal & (codes == FLUTTER) & (inverse_gain * typical > 1e5))
     # With damping, undamped modes that meet say nothing; but they may do so at the very gain of a crossing: where it is equal.
@@ -96,13 +94,17 @@ def first_limit(loop: Loop) -> Limit:
     between = jnp.minimum(0.5 * (lower + upper), jnp.maximum(2 * lower, typical))
     empty = ~jnp.isfinite(lower) | (upper <= lower * (1 + 1e-11))
 
+    def unstable(gain):
+        closed = state + jnp.outer(input_, row) * gain / (1 - gain * impulsive)
+        return significant_growth(in_natural_units(closed, 1.0)) > 0
+
     def not_found(carry):
         i, found = carry
         return (i < lower.size) & ~found
 
     def step(carry):
         i, _ = carry
-        return i + 1, ~empty[i] & system.is_unstable(between[i])
+        return i + 1, ~empty[i] & unstable(between[i])
 
     i, found = jax.lax.while_loop(not_found, step, (jnp.zeros((), jnp.int32), jnp.array(False)))
     last = i - 1
@@ -153,8 +155,10 @@ def _(primals, tangents):
     return limit, tangent
 
 
-def _crossings(loop: Loop, system: _StateSpace) -> tuple[Float[Array, " k"], Float[Array, " k"], Int[Array, " k"]]:
-    """The inverse of the gain, the frequency and the kind of all crossings; the inverse is zero where there is none."""
+def _crossings(loop: Loop, system: _StateSpace) -> tuple[Float[Array, " k"], Float[Array, " k"], list[int]]:
+    """The inverse of the gain, the frequency and the kind of all crossings between zero and infinity; the inverse is zero where
+    there is none.
+    """
     m = len(system.column)
     eye, none = np.eye(m), np.zeros((m, m))
     stiffness, damping = system.stiffness, system.damping
@@ -175,11 +179,7 @@ def _crossings(loop: Loop, system: _StateSpace) -> tuple[Float[Array, " k"], Flo
     real_frequency = (squares.real < 0) & (jnp.abs(squares.imag) < 1e-6 * jnp.abs(squares))
     inverse_gain = jnp.where(real_frequency, inverse_gain, 0.0)
     each = squares.size // 2
-    return (
-        jnp.concatenate([inverse_gain, jnp.stack(loop.limits)]),
-        jnp.concatenate([omega, jnp.array([0.0, jnp.inf])]),
-        jnp.array([FLUTTER] * each + [COALESCENCE] * each + [DIVERGENCE, PAINLEVE], jnp.int32),
-    )
+    return inverse_gain, omega, [FLUTTER] * each + [COALESCENCE] * each
 
 
 def _scales(stiffness: Float[Array, "m m"]) -> Float[Array, " 3"]:

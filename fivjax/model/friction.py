@@ -22,12 +22,6 @@ from ..foundation.smoothness import is_smooth
 from ..foundation.taylor import composed, taylor_coefficients
 from .printing import as_call
 
-# What JAX raises where the number of something traced is asked for.
-NEEDS_NUMBERS = (
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-    jax.errors.ConcretizationTypeError,
-)
 # Gives the next Taylor coefficient in time of μ, from those of the slip speed up to the same order and from those of μ so far.
 NextTerm = Callable[[list[Array], list[Array]], Array]
 
@@ -164,7 +158,7 @@ class AbstractFriction(eqx.Module):
             speed = jax.ShapeDtypeStruct((), np.dtype("float64"))
             try:
                 traced, found = jax.make_jaxpr(lambda speed: self(speed), return_shape=True)(speed)
-            except NEEDS_NUMBERS as error:
+            except arguments.NEEDS_NUMBERS as error:
                 raise TypeError(
                     f"The friction law `{name}` must be a JAX function, but asks for a value while it is traced. "
                     f"Use `jax.numpy` in place of NumPy, and `jnp.where` in place of `if`. {more}"
@@ -205,7 +199,7 @@ def rebuilt(part, changes: Mapping):
     own = {name: value for name, value in vars(part).items() if value is not None}
     try:
         return type(part)(**{name: changes.get(name, value) for name, value in own.items()})
-    except NEEDS_NUMBERS as error:
+    except arguments.NEEDS_NUMBERS as error:
         raise TypeError(
             f"The constructor of `{type(part).__name__}` must take what JAX traces, but asks for a number, as `float(…)` and "
             f"`if` do. Keep what it is given by `jnp.asarray`, and leave checks of values to where these are known."

@@ -234,7 +234,7 @@ class Structure(eqx.Module):
         source = FromParameters(numbers, tuple(numbers), first_like(matrices_of), dampers, builder)
         try:
             matrices = source.matrices
-        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+        except arguments.NEEDS_NUMBERS as error:
             raise TypeError(
                 "Argument `matrices_of` must work out by `jax.numpy` what depends on its parameters, as maps and derivatives "
                 "over them demand. NumPy, `math` and `if` need the numbers; `jnp.array`, `jnp.sqrt` and `jnp.where` do not."

@@ -192,7 +192,7 @@ def _differentiated(functional, scene, names, t1, dt_save, y0, energy, mode, met
         run = simulate(scene.replace(**values), t1, dt_save, method, y0=y0, energy=energy, derivatives=mode)
         try:
             value = functional(run)
-        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+        except arguments.NEEDS_NUMBERS as error:
             raise TypeError(
                 "Argument `functional` must be a JAX function, but asks for a value while it is traced. Use `jax.numpy` in "
                 "place of NumPy, and no `float` or `if`."

@@ -2,8 +2,10 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -235,8 +237,10 @@ def simulate(
         if has_kernel(scene, method):
             ending, found = _by_kernel(scene, method, given, saved, most, bool(energy), known)
         else:
-            modes = None if derivatives == "none" else derivatives
-            ending, found = _by_xla(scene, method, given, saved, most, bool(energy), modes)
+            traced = functools.partial(rows_at, derivatives=None if derivatives == "none" else derivatives)
+            # Runs with known values are not differentiated.
+            rows = rows_in_parts if known else traced
+            ending, found = _by_xla(scene, method, given, saved, most, bool(energy), rows)
     if not is_known(found["velocity"]):
         found = _without_derivatives_unless_begun(found)
     settings = (
@@ -299,15 +303,11 @@ def _by_kernel(
 
 
 def _by_xla(
-    scene: Scene, method, given: State | None, saved, most: int, energy: bool, derivatives: str | None
+    scene: Scene, method, given: State | None, saved, most: int, energy: bool, rows: Callable[..., dict]
 ) -> tuple[Array | np.int8, dict]:
-    """The same without a kernel."""
+    """The same without a kernel, by `rows_in_parts` or `rows_at`."""
     stepper, y0 = with_step_as_array(method), start_state(scene, None) if given is None else given
-    # Runs with known values are not differentiated.
-    if all(map(is_known, jax.tree.leaves((scene, method, y0)))):
-        found = rows_in_parts(scene, stepper, y0, saved, most, energy)
-    else:
-        found = rows_at(scene, stepper, y0, saved, most, energy, derivatives)
+    found = rows(scene, stepper, y0, saved, most, energy)
     return _ending(scene, stepper, found, found.pop("grown"), most, given is None), found
 
 
