@@ -46,13 +46,16 @@ def stuck(mechanics: Mechanics, contact: Contact, y: State) -> State:
     soon, by an impulse in proportion to it, which moves whatever the mass matrix couples to the contact. So the state is as
     after the impulse that holds it: itself, but for its derivatives.
     """
+    return jnp.where(jnp.any(contact.status == Status.STICK), _held(mechanics, contact, y), y)
+
+
+def _held(mechanics: Mechanics, contact: Contact, y: State) -> State:
+    """The state after the impulses that a mode needs at once: those that end what slip and gap rates it forbids."""
     n = degrees_of_freedom(y)
     relative = y[n:].at[mechanics.tangential].add(-mechanics.belt_speed)
     own = mechanics.of_totals
-    impulses = ModeForces(own, contact, own.friction(jnp.zeros_like(contact.direction))).added(own, relative)
-    kick = sum(spread(*of) for of in zip((own.from_tangential, own.from_normal), impulses, strict=True))
-    holds = jnp.any(contact.status == Status.STICK)
-    return y.at[n:].add(jnp.where(holds, kick, 0.0))
+    impulses = ModeForces(own, contact, own.friction(jnp.abs(relative_velocity(mechanics, y)))).added(own, relative)
+    return y.at[n:].add(sum(spread(*of) for of in zip((own.from_tangential, own.from_normal), impulses, strict=True)))
 
 
 def transition(
@@ -161,6 +164,11 @@ def _struck(
         lifted = reached & (contact.status != Status.DETACH) & (own > 0)
         free = Contact(jnp.where(lifted, Status.DETACH, contact.status), contact.direction)
         rests = rests | (lifted & _ends_within(resolution, own, _fall(mechanics, free, load, y)))
+        # Its landing's impulse is more, by that which lifts it, than the force at rest that its flight is without.
+        slip = relative_velocity(mechanics, y_struck)
+        at_rest = rests | ((gap(mechanics, y_struck) <= 0) & (own == 0))
+        of_rest = jnp.where(at_rest, jnp.where(slip == 0, Status.STICK, Status.SLIDE), Status.DETACH)
+        y_struck = _held(mechanics, Contact(of_rest.astype(contact.status.dtype), -jnp.sign(slip)), y_struck)
     return with_contact_coordinates(
         mechanics,
         y_struck,

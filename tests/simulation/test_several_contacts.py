@@ -578,7 +578,7 @@ def test_steps_of_one_length_come_to_rest_where_an_impact_lifts_another_contact(
     scene = fj.Scene(structure, fj.Coulomb(0.2), np.ones(2), fj.ConstantLoad(10.0), impact_law="frictionless")
     y0 = [0.0, 0.0, 0.1, 0.0, *np.zeros(4)]
     exact = fj.simulate(scene, 2.0, 0.01, y0=y0)
-    stepped = fj.simulate(scene, 2.0, 0.01, fj.WhereSwitched(diffrax.Heun(), dt=1e-4), y0=y0)
+    stepped = fj.simulate(scene, 2.0, 0.01, fj.WhereSwitched(diffrax.Heun(), dt=1e-3), y0=y0)
     assert np.mean(np.any(stepped.status != exact.status, axis=1)) < 0.02 and np.any(exact.status == 2)
-    # The error is of first order: 6e-3 of the size at 1e-3 s. It was 0.25 with any step.
-    np.testing.assert_allclose(stepped.displacement, exact.displacement, atol=1e-3 * np.abs(exact.displacement).max())
+    # Of first order: 0.0033 of the size. It was 0.25 with any step, and 0.0057 as long as the other contact felt no impulse.
+    np.testing.assert_allclose(stepped.displacement, exact.displacement, atol=4e-3 * np.abs(exact.displacement).max())
