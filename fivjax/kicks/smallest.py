@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple, overload
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..cycles.own_coordinates import in_own_coordinates
@@ -338,4 +337,4 @@ def _compiled_peaks(shares, envelope):
 
 
 def _peaks(shares, envelope) -> np.ndarray:
-    return np.asarray(_compiled_peaks(jnp.atleast_2d(jnp.asarray(shares)), jax.tree.map(jnp.asarray, envelope)))
+    return np.asarray(_compiled_peaks(np.atleast_2d(shares), envelope))
