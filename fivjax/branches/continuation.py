@@ -120,7 +120,7 @@ def continue_cycle(
             f"Argument `bounds` must hold the scene's own {parameter}, {own}, but is ({lower}, {upper}). "
             f"Widen it, or begin with a scene whose {parameter} lies between them."
         )
-    arguments.whole_number("points", points, minimum=2)
+    points = arguments.whole_number("points", points, minimum=2)
     arguments.truth("derivatives", derivatives)
     cycle = limit_cycle(final, start)
     if cycle.kind != "periodic" and start is None:

@@ -254,6 +254,6 @@ def multipliers_of(found: PhaseImages) -> Complex[np.ndarray, " m"]:
     """Floquet multipliers without the one for a deviation along the cycle, largest first; NaN at a grazing."""
     matrix = monodromy(found)
     if not np.all(np.isfinite(matrix)):
-        return np.full(len(matrix) - 1, np.nan, complex)
+        return np.full(len(matrix) - 1, complex(np.nan, np.nan))
     values = np.linalg.eigvals(matrix).astype(complex)
     return values[np.lexsort((-values.imag, -np.abs(values)))][:-1]

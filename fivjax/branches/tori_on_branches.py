@@ -52,7 +52,7 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
 
     if not {"multipliers", "special", "parameter"} <= set(getattr(branch, "variables", ())):
         raise ValueError("Argument `branch` must come from `fivjax.continue_cycle`.")
-    arguments.whole_number("points", points, minimum=1)
+    points = arguments.whole_number("points", points, minimum=1)
     places = turning(np.asarray(branch["multipliers"]))
     places = places[branch["special"].values[places] == ""]
     places = (

@@ -82,6 +82,7 @@ def calibrate(
     # The least number of starts for limit cycles: to find a scene that vibrates similarly to the measured one.
     screened = 32
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     refuse_vector_contacts(scene.structure, "`calibrate`")
     recordings = (data,) if isinstance(data, Recording) else tuple(data) if isinstance(data, list | tuple) else data
     if not isinstance(recordings, tuple) or not recordings:
@@ -96,9 +97,9 @@ def calibrate(
             raise ValueError(
                 f"Parameter `{both[0]}` is free, but recording {k} states it as known. Drop one of the two."
             )
-    arguments.whole_number("starts", starts, minimum=1)
+    starts = arguments.whole_number("starts", starts, minimum=1)
     arguments.real_number("spread", spread, above=0, maximum=0.9)
-    arguments.whole_number("seed", seed, minimum=0)
+    seed = arguments.whole_number("seed", seed, minimum=0)
     arguments.real_number("identifiable_within", identifiable_within, above=0)
     method = EventExact() if method is None else method
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
@@ -123,13 +124,13 @@ def calibrate(
         return not_tried(problem, recordings, FitOutcome.BEATS)
     if cycles:
         frequencies = [float(cycle.frequency) for cycle in problem.cycles]
-        half = max(int(starts), screened) // 2
+        half = max(starts, screened) // 2
         # A limit cycle needs two modes of similar frequency, but its own frequency may be somewhat lower.
         near = near_frequencies(parameters, scene, frequencies, half, float(spread), seed)
         around = latin_hypercube(parameters, scene, half, float(spread), seed)
         guesses = np.concatenate([near, around[1:]])
     else:
-        guesses = latin_hypercube(parameters, scene, int(starts), float(spread), seed)
+        guesses = latin_hypercube(parameters, scene, starts, float(spread), seed)
     search = FitSearch(problem, guesses, recordings)
     with following("calibrate", shown=progress, total=search.count, unit=" stages"):
         for number, words in enumerate(search.run()):

@@ -30,13 +30,20 @@ class CycleCommand:
         scene = self.scene.scene()
         try:
             cycle = fj.limit_cycle(scene)
-            others = [fj.saddle_cycle(scene, cycle)] if self.saddle else []
         except fj.NoLimitCycle as none:
             raise Failure(str(none)) from none
         write_data(cycle, data)
+        others, missing = [], None
+        if self.saddle:
+            try:
+                others = [fj.saddle_cycle(scene, cycle)]
+            except fj.NoLimitCycle as none:
+                missing = none
         write_picture(fj.plot.cycle(cycle, others), picture)
         for one in (cycle, *others):
             print(one)
+        if missing is not None:
+            raise Failure(str(missing)) from missing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,9 +81,10 @@ class Branch:
         scene = self.scene.scene()
         if upwards is not None:
             # Before the branches are computed, which takes minutes.
-            from ..maps.axes import checked_axes
+            from ..maps.axes import check_size, checked_axes
 
             checked_axes(scene, {upwards[0]: upwards[1]})
+            check_size({name: upwards[1], upwards[0]: upwards[1]})
         branches = {}
         labels = [""] if other is None else [f"{other} = {value}" for value in apart(*values)]
         # Before the first branch is computed, all are checked.

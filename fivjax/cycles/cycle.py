@@ -12,6 +12,7 @@ from ..attractors.cycles import FAMILY_TOLERANCE
 from ..contact import Contact, Status
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
+from ..io.datasets import named
 from ..model.load import ConstantLoad
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
@@ -27,6 +28,21 @@ if TYPE_CHECKING:
 MARGIN = 1e-9
 # What not every cycle has.
 OPTIONAL = ("rotation_number", "reach", "contraction")
+
+
+# Long names and units of what only files of cycles hold.
+OF_CYCLES = {
+    "multiplier_real": ("Floquet multiplier, real part", "1"),
+    "multiplier_imaginary": ("Floquet multiplier, imaginary part", "1"),
+    "harmonics_real": ("Fourier coefficient of the velocity, real part", "m/s"),
+    "harmonics_imaginary": ("Fourier coefficient of the velocity, imaginary part", "m/s"),
+    "section_point": ("state on the section: displacements, then velocities", "m, m/s"),
+    "section_status": ("contact status on the section (0 stick, 1 slide, 2 detach)", "1"),
+    "section_direction": ("direction of friction on the section", "1"),
+    "return_jacobian": ("derivative of the return by the state", "SI"),
+    "word_status": ("contact status of a phase (0 stick, 1 slide, 2 detach)", "1"),
+    "word_duration": ("duration of a phase", "s"),
+}
 
 
 class LimitCycle(eqx.Module):
@@ -111,8 +127,8 @@ class LimitCycle(eqx.Module):
 
         **Raises:** `ValueError` for a number of points that is not positive.
         """
-        arguments.whole_number("points", points, minimum=1)
-        arguments.whole_number("periods", periods, minimum=1)
+        points = arguments.whole_number("points", points, minimum=1)
+        periods = arguments.whole_number("periods", periods, minimum=1)
         end = periods * self.period
         return simulate(self.scene, t1=end, dt_save=end / points, y0=self.state, energy=energy)
 
@@ -160,7 +176,7 @@ class LimitCycle(eqx.Module):
         dataset = self.trajectory().to_dataset()
         each = ("contact",) * np.ndim(self.contact.status)
         optional = {name: getattr(self, name) for name in OPTIONAL}
-        return dataset.assign(
+        dataset = dataset.assign(
             multiplier_real=("multiplier", self.multipliers.real),
             multiplier_imaginary=("multiplier", self.multipliers.imag),
             harmonics_real=(("order", "coordinate"), self.harmonics.real),
@@ -171,7 +187,8 @@ class LimitCycle(eqx.Module):
             return_jacobian=(("state", "before"), np.asarray(self.return_jacobian)),
             word_status=(("phase", *each), np.array([phase.status for phase in self.word], int)),
             word_duration=("phase", [phase.duration for phase in self.word]),
-        ).assign_attrs(
+        )
+        return named(dataset, **OF_CYCLES).assign_attrs(
             kind=self.kind,
             period=self.period,
             amplitude=self.amplitude,

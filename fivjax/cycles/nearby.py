@@ -98,7 +98,7 @@ def nearby_cycle(scene: Scene, cycle: LimitCycle, *, stages: int = 1, multiplier
             "Argument `cycle` must hold known numbers, but is traced. Close over it, "
             "`jax.jit(lambda scene: fj.nearby_cycle(scene, cycle))`: the scene may be traced."
         )
-    arguments.whole_number("stages", stages, minimum=1)
+    stages = arguments.whole_number("stages", stages, minimum=1)
     arguments.truth("multipliers", multipliers)
     if cycle.kind != "periodic":
         raise ValueError("Argument `cycle` must be periodic, but is a torus, on which no state returns.")

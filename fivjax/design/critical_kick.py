@@ -122,11 +122,17 @@ def raise_critical_perturbation(
         True
     """
     names, start, low, high = _checked(scene, by, free, bounds)
-    arguments.whole_number("steps", steps, minimum=2)
+    steps = arguments.whole_number("steps", steps, minimum=2)
     size = np.abs(start)
 
     def at(r: np.ndarray):
-        changed = scene.replace(**dict(zip(names, (float(x) for x in start + r * size), strict=True)))
+        try:
+            changed = scene.replace(**dict(zip(names, (float(x) for x in start + r * size), strict=True)))
+        except ValueError as refused:
+            # Between bounds that are scenes one by one there may be none, as where static friction is below the dynamic one.
+            return _Iterate(
+                scene, r, np.nan, np.full(len(names), np.nan), (np.nan, np.nan), f"no scene has that ({refused})"
+            )
         found = critical_perturbation(
             changed, p_range=p_range, p_step=p_step, tolerance=BRACKET, derivatives=True, progress=False
         )
@@ -264,6 +270,8 @@ def _checked(scene: Scene, by, free, bounds):
                 f"Parameter `{name}` is zero, so a relative change of it has no meaning. Leave it out of `free`."
             )
         pair = arguments.bounds_about(name, bounds.get(name, sorted((0.5 * own, 2 * own))), own)
+        for end in pair if name in bounds else ():
+            scene.replace(**{name: float(end)})
         limits.append((pair - own) / abs(own))
     low, high = np.array(limits).T
     return names, start, low, high

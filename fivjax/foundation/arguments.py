@@ -62,10 +62,11 @@ def is_whole(value) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
 
 
-def whole_number(name: str, value, *, minimum: int) -> None:
-    """Refuse anything but one whole number of at least `minimum`."""
+def whole_number(name: str, value, *, minimum: int) -> int:
+    """`value` as an `int`, if it is one whole number of at least `minimum`; one of NumPy's can overflow."""
     if not is_whole(value) or value < minimum:
         raise ValueError(f"Argument `{name}` must be a whole number of at least {minimum}, but is {value!r}.")
+    return int(value)
 
 
 def numeric_array(name: str, value) -> np.ndarray:

@@ -286,7 +286,7 @@ def _eigen(matrices, left: bool, right: bool):
 
     kept = 1 + left + right
     shape, size = matrices.shape[:-2], matrices.shape[-1]
-    found = [np.full((*shape, *(size,) * (1 + (k > 0))), np.nan, complex) for k in range(kept)]
+    found = [np.full((*shape, *(size,) * (1 + (k > 0))), complex(np.nan, np.nan)) for k in range(kept)]
     for at in np.ndindex(*shape):
         # As by JAX, nothing is a number where the matrix is none, or where the routine does not converge.
         if not np.all(np.isfinite(matrices[at])):

@@ -53,8 +53,7 @@ def frequency_response(given: Any) -> FrequencyResponse | None:
         )
     cutoff, order = given
     arguments.real_number("filter[0]", cutoff, above=0)
-    arguments.whole_number("filter[1]", order, minimum=1)
-    return LowPass(float(cutoff), int(order))
+    return LowPass(float(cutoff), arguments.whole_number("filter[1]", order, minimum=1))
 
 
 def memory(response: FrequencyResponse, step: float) -> float:

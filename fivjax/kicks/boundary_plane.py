@@ -73,7 +73,7 @@ def boundary_section(
     arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p leads to the boundary")
     arguments.real_number("reach", reach, above=0)
-    arguments.whole_number("points", points, minimum=3)
+    points = arguments.whole_number("points", points, minimum=3)
     found = critical_perturbation(scene, p_range=p_range, progress=False)
     found = found.squeeze(found["p_crit"].dims)
     bracket = float(found["p_crit_low"]), float(found["p_crit_high"])

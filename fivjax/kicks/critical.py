@@ -11,7 +11,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import check_axis_names, labelled, named
-from ..maps.axes import at_middle, check_run, check_size, checked_axes, linear_limit
+from ..maps.axes import at_middle, check_size, checked_axes, checked_time_limit, linear_limit
 from ..maps.crossing import FirstCrossing
 from ..maps.datasets import time_limit
 from ..maps.engine import RunOptions
@@ -103,7 +103,7 @@ def critical_perturbation(
         array([1.107206, 1.190282])
     """
     method = EventExact() if method is None else method
-    check_run(scene, method, t_max, memory)
+    t_max = checked_time_limit(scene, method, t_max, memory)
     arguments.truth("energy", energy)
     arguments.truth("derivatives", derivatives)
     if derivatives and not isinstance(method, EventExact):

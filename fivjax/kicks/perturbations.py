@@ -185,7 +185,13 @@ class Histories:
     def certificate(self) -> Certificate:
         rates = np.asarray(self.sliding.modes.eigenvalues)
         edges, fastest = np.linspace(0.0, self.time, self.pieces + 1), np.max(np.abs(rates))
-        count = int(np.ceil(FINE * fastest * self.time / (2 * np.pi * self.pieces)))
+        periods = fastest * self.time / (2 * np.pi)
+        if FINE * periods > MOST_INSTANTS:
+            raise ValueError(
+                f"A history of {self.time:g} s holds {periods:.0f} periods of the fastest mode, and a certified bound is known "
+                f"for up to {MOST_INSTANTS // FINE}. Shorten it, or leave out modes that are so fast."
+            )
+        count = int(np.ceil(FINE * periods / self.pieces))
         inside = np.linspace(0.0, self.time / self.pieces, count + 1)
         size, shapes = np.inf, []
         for shares, margin, presses in self.sliding.margins:

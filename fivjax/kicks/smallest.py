@@ -224,7 +224,7 @@ def smallest_kick(
 
 def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], pieces: int) -> SmallestPerturbation:
     """The smallest initial state or history of the load."""
-    arguments.whole_number("pieces", pieces, minimum=1)
+    pieces = arguments.whole_number("pieces", pieces, minimum=1)
     allowed = ("duration",) if over == "history" else ()
     unknown = sorted(set(bounds) - set(allowed))
     if unknown:

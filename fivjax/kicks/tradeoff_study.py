@@ -189,15 +189,16 @@ def _checked_precisions(precisions) -> tuple[str, ...]:
 
 def _check(scene, methods, t1, trajectories, boundary, refine) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     if not isinstance(methods, dict) or not methods:
         raise TypeError("Argument `methods` must be a dict of steppers by name, such as {'exact': fj.EventExact()}.")
     for name, method in methods.items():
         arguments.instance(f"methods[{name!r}]", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
-    arguments.whole_number("trajectories", trajectories, minimum=1)
+    trajectories = arguments.whole_number("trajectories", trajectories, minimum=1)
     refuse_painleve(scene)
     arguments.truth("boundary", boundary)
-    arguments.whole_number("refine", refine, minimum=0)
+    refine = arguments.whole_number("refine", refine, minimum=0)
     if boundary or refine:
         arguments.instance(
             "scene.load", scene.load, Pulse, "a Pulse, whose p is varied (or pass boundary=False and refine=0)"

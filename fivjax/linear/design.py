@@ -134,6 +134,7 @@ def lower_growth_rate(
 
         >>> better = fj.design.lower_growth_rate(structure, {"k1": (98e3, 102e3)}, mu=0.25, steps=5)  # doctest: +SLOW
     """
+    within = _checked_bounds(structure, bounds, tied)
     frictions = arguments.axis("mu", mu)
     arguments.real_number("mu", frictions[0], minimum=0)
     if target is not None:
@@ -147,7 +148,7 @@ def lower_growth_rate(
     mass, _, stiffness, *_ = map(np.asarray, structure.matrices)
     unit = 1e-4 * float(np.sqrt(np.max(np.abs(np.diag(stiffness) / np.diag(mass)))))
     goal = _Goal("worst growth rate", quantity, target, direction, larger_is_better=False, unit=unit)
-    return _design(structure, _checked_bounds(structure, bounds, tied), tied or {}, goal, steps, rate)
+    return _design(structure, within, tied or {}, goal, steps, rate)
 
 
 class _Goal(NamedTuple):
@@ -174,7 +175,7 @@ def _design(structure: Structure, within: "_Bounds", tied, goal: _Goal, steps: i
     name, quantity, target, direction, larger_is_better, _ = goal
     names, low, width = within
     check_axis_names({*names, *tied}, ("step", name.replace(" ", "_")), "designs")
-    arguments.whole_number("steps", steps, minimum=1)
+    steps = arguments.whole_number("steps", steps, minimum=1)
     arguments.real_number("rate", rate, above=0)
     start = np.array([(float(structure.parameters[key]) - low[i]) / width[i] for i, key in enumerate(names)])
 
@@ -188,6 +189,9 @@ def _design(structure: Structure, within: "_Bounds", tied, goal: _Goal, steps: i
                 f"A function in `tied` asks for {unknown}, which is no parameter of the structure; it has: "
                 f"{', '.join(structure.parameters)}."
             ) from None
+
+    # What `tied` gives is refused before anything compiles.
+    structure.replace(**values(start))
 
     def loss_and_quantity(shares):
         reached = quantity(structure.replace(**values(shares)))
@@ -243,6 +247,7 @@ class _Bounds(NamedTuple):
 
 def _checked_bounds(structure: Structure, bounds, tied) -> _Bounds:
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    arguments.known("structure", structure)
     bounds = arguments.by_name("bounds", bounds, '"k1": (90e3, 110e3)')
     if not bounds:
         raise ValueError('Argument `bounds` must name at least one parameter, such as {"k1": (90e3, 110e3)}.')

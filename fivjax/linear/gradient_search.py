@@ -128,11 +128,12 @@ def search_critical_friction(
         >>> found = fj.design.search_critical_friction(structure, start=0.1)  # doctest: +SLOW
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    arguments.known("structure", structure)
     arguments.real_number("start", start, above=0)
     arguments.real_number("highest", highest, minimum=float(start))
     arguments.one_of("route", route, ("eigenvalues", "routh-hurwitz"))
     direction = checked_direction(direction)
-    arguments.whole_number("max_steps", max_steps, minimum=1)
+    max_steps = arguments.whole_number("max_steps", max_steps, minimum=1)
     if route == "routh-hurwitz" and is_known(structure.damping) and not np.any(np.asarray(structure.damping)):
         raise ValueError(
             'Argument `route` must be "eigenvalues" for an undamped structure: all its motions are on the limit, so '

@@ -45,15 +45,18 @@ def eigenvalue_derivatives(modes: ComplexModes, changes: Mapping[str, Pencil], w
     if not np.all(np.isin(which, np.arange(-count, count))):
         raise ValueError(f"Argument `which` must hold indices of the {count} modes, but is {which.tolist()}.")
     which = which.astype(int)
-    found = {name: np.full(which.size, np.nan, complex) for name in changes}
-    # Left and right eigenvectors that are this nearly orthogonal belong to equal eigenvalues, up to rounding.
-    right_angle = 1e-6
+    found = {name: np.full(which.size, complex(np.nan, np.nan)) for name in changes}
+    # Eigenvalues this near to each other are equal, up to rounding. So are those whose left and right eigenvectors are this
+    # nearly orthogonal.
+    nearly = 1e-6
     for k, place in enumerate(which):
         value = modes.eigenvalues[place]
+        if np.any(np.abs(np.delete(modes.eigenvalues, place) - value) <= nearly * _size_of(modes.pencil, value)):
+            continue
         right, left = eigenvectors(modes.pencil, value)
         slope = left.conj() @ (modes.pencil.slope(value) @ right)
         size = np.linalg.norm(left) * np.linalg.norm(modes.pencil.slope(value) @ right)
-        if abs(slope) < right_angle * size:
+        if abs(slope) <= nearly * size:
             continue
         for name, change in changes.items():
             found[name][k] = -(left.conj() @ (change.at(value) @ right)) / slope
@@ -64,8 +67,7 @@ def eigenvectors(pencil: Pencil, value: complex) -> tuple[np.ndarray, np.ndarray
     """Right and left eigenvector of the eigenvalue nearest to a value, by inverse iteration with one factorisation."""
     from scipy.sparse.linalg import splu
 
-    # Rigid-body motions, at zero, have no size of their own; that of the other eigenvalues is a measure.
-    size = abs(value) or np.sqrt(abs(pencil.stiffness).sum() / abs(pencil.mass).sum())
+    size = _size_of(pencil, value)
     # The matrix is factorised at this relative distance from the eigenvalue: near enough for convergence in two steps, far
     # enough not to be singular.
     apart = 1e-8
@@ -77,6 +79,11 @@ def eigenvectors(pencil: Pencil, value: complex) -> tuple[np.ndarray, np.ndarray
             vector = factors.solve(vector / np.linalg.norm(vector), trans=transposition)
         found.append(vector / np.linalg.norm(vector))
     return found[0], found[1]
+
+
+def _size_of(pencil: Pencil, value: complex) -> float:
+    # Rigid-body motions, at zero, have no size of their own; that of the other eigenvalues is a measure.
+    return abs(value) or np.sqrt(abs(pencil.stiffness).sum() / abs(pencil.mass).sum())
 
 
 def shape_basis(pencil: Pencil, *modes: ComplexModes, coordinates: int = 60) -> np.ndarray:
@@ -95,7 +102,7 @@ def shape_basis(pencil: Pencil, *modes: ComplexModes, coordinates: int = 60) -> 
     **Returns:** `(n, m)`, with m at most `coordinates`.
     """
     arguments.instance("pencil", pencil, Pencil, "a Pencil, such as `cea.sliding_pencil` returns")
-    arguments.whole_number("coordinates", coordinates, minimum=1)
+    coordinates = arguments.whole_number("coordinates", coordinates, minimum=1)
     for k, found in enumerate(modes):
         arguments.instance(f"modes[{k}]", found, ComplexModes, "modes, such as `cea.complex_modes` returns")
     if not modes or any(found.shapes.shape[0] != pencil.size for found in modes):

@@ -140,7 +140,7 @@ def sliding_rates(scene: Scene) -> Complex[np.ndarray, " m"]:
     """Eigenvalues of steady sliding, in 1/s, the fastest growing first; NaN where it has no finite state matrix."""
     matrix = np.asarray(sliding_matrix(scene))
     if not np.all(np.isfinite(matrix)):
-        return np.full(len(matrix), np.nan, complex)
+        return np.full(len(matrix), complex(np.nan, np.nan))
     values = np.linalg.eigvals(matrix).astype(complex)
     return values[np.lexsort((-values.imag, -values.real))]
 

@@ -102,8 +102,8 @@ def _modes_dataset(scene: Scene, name: str, values: np.ndarray, followed: list) 
     structure = scene.structure
     n, keep = structure.size, free_in_sliding(in_contact_coordinates(structure))
     m = len(keep)
-    eigenvalue, partner = np.full((2, len(values), m), np.nan, complex)
-    shape = np.full((len(values), m, n), np.nan, complex)
+    eigenvalue, partner = np.full((2, len(values), m), complex(np.nan, np.nan))
+    shape = np.full((len(values), m, n), complex(np.nan, np.nan))
     for k, sample in enumerate(followed):
         if sample is not None:
             eigenvalue[k], partner[k] = sample.eigenvalue, sample.partner

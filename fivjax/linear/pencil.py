@@ -94,7 +94,10 @@ def sliding_pencil(system: Structure | SparseStructure, mu, *, direction=1) -> P
 
 def friction_derivative(system: Structure | SparseStructure, mu, *, direction=1) -> Pencil:
     """The derivative of the sliding pencil at `mu`, by what is added to the friction coefficients of all contacts."""
-    bases, signs = _Bases.of(system), signed_friction(system, np.ones_like(np.asarray(mu, float)), direction)
+    bases, signs = (
+        _Bases.of(system),
+        signed_friction(system, np.ones_like(arguments.numeric_array("mu", mu)), direction),
+    )
     slope = bases.left_slope(signed_friction(system, mu, direction), signs)
     return Pencil(*(slope.T @ (matrix @ bases.right) for matrix in _sparse_matrices(system)))
 
@@ -150,6 +153,7 @@ class _Bases(NamedTuple):
         arguments.instance(
             "system", system, Structure | SparseStructure, "a Structure, or what `read_structure` returns"
         )
+        arguments.known("system", system)
         normal, tangential = system.normal_directions, system.tangential_directions
         if not normal.shape[1]:
             raise ValueError("The structure has no contacts. Give `contacts` to `read_structure`, or use `cea.Pencil`.")

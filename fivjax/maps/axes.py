@@ -106,7 +106,8 @@ def _count(values) -> int:
         return 1
 
 
-def check_run(scene: Scene, method: AbstractStepper, t_max: float | None, memory: float) -> None:
+def checked_time_limit(scene: Scene, method: AbstractStepper, t_max: float | None, memory: float) -> float | None:
+    """`t_max` as a number of Python's, which files can hold, once it and what else all maps are given is in order."""
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
@@ -117,3 +118,4 @@ def check_run(scene: Scene, method: AbstractStepper, t_max: float | None, memory
     batched = [name for name, value in scene.parameters.items() if np.shape(value) != () and name not in per_contact]
     if batched:
         raise ValueError(f"Parameter `{batched[0]}` of the scene must be one number; pass its values as an axis.")
+    return None if t_max is None else float(t_max)

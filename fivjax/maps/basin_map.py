@@ -18,7 +18,7 @@ from ..model.structure import Structure
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
-from .axes import at_middle, check_names, check_run, check_size, checked_axes, linear_limit
+from .axes import at_middle, check_names, check_size, checked_axes, checked_time_limit, linear_limit
 from .datasets import map_dataset, wilson
 from .engine import RunOptions, run_to_verdict
 from .executors import with_workers
@@ -96,7 +96,7 @@ def basins(
         True
     """
     method = EventExact() if method is None else method
-    check_run(scene, method, t_max, memory)
+    t_max = checked_time_limit(scene, method, t_max, memory)
     arguments.truth("kick", kick)
     kicked = scene
     if not kick:

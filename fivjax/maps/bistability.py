@@ -15,7 +15,7 @@ from ..foundation.stopping import stop_requests
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
-from .axes import at_middle, check_run, check_size, checked_axes, linear_limit
+from .axes import at_middle, check_size, checked_axes, checked_time_limit, linear_limit
 from .datasets import audit_note, map_dataset
 from .engine import RunOptions, interrupted, run_to_verdict
 from .executors import with_workers
@@ -109,15 +109,15 @@ def bistability_map(
         array([0, 0, 1, 1, 1], dtype=int8)
     """
     method = EventExact() if method is None else method
-    check_run(scene, method, t_max, memory)
-    arguments.whole_number("max_steps", max_steps, minimum=1)
+    t_max = checked_time_limit(scene, method, t_max, memory)
+    max_steps = arguments.whole_number("max_steps", max_steps, minimum=1)
     arguments.truth("energy", energy)
     if not axes:
         raise ValueError(
             "A map needs at least one axis, such as `mu=np.linspace(0.05, 0.228, 64)`; the scene has: "
             f"{', '.join(sorted(scene.parameters))}."
         )
-    arguments.whole_number("refine", refine, minimum=0)
+    refine = arguments.whole_number("refine", refine, minimum=0)
     arguments.real_number("audit", audit, minimum=0, maximum=1)
     arguments.truth("sparse", sparse)
     if sparse and not refine:
@@ -129,8 +129,8 @@ def bistability_map(
     followed = at_middle(scene, axes)
     axes = {name: finer_axis(values, refine) for name, values in axes.items()}
     grid = Grid(axes, of_kick=kick_of(scene))
-    limits = Limits(t_max, int(max_steps), bool(energy))
-    refinement = {"refine": int(refine), "audit": float(audit)} if refine else {}
+    limits = Limits(t_max, max_steps, bool(energy))
+    refinement = {"refine": refine, "audit": float(audit)} if refine else {}
     refinement |= {"sparse": True} if sparse else {}
     keeper = keeper_at(resume, scene, method, grid, limits._asdict() | refinement, limits.energy, sparse)
     options = RunOptions("map", memory, progress, executor, keeper)

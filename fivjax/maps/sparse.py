@@ -80,7 +80,7 @@ def window(points: xr.Dataset, *, most: int = 1000, **bounds: tuple[float, float
         >>> part["verdict"].shape  # doctest: +SLOW
         (9, 9)
     """
-    arguments.whole_number("most", most, minimum=1)
+    most = arguments.whole_number("most", most, minimum=1)
     axes, refined, points = _grid_of(points)
     unknown = [name for name in bounds if name not in axes]
     if unknown:

@@ -50,6 +50,7 @@ def explorer(
         >>> explorer = fj.explorer(scene, t1=0.5)  # doctest: +SLOW
     """
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     refuse_vector_contacts(scene.structure, "`explorer`")
     arguments.real_number("t1", t1, above=0)
     if dataset is not None:
@@ -88,7 +89,7 @@ class Explorer:
         self.picture = picture(name="response", layout=PICTURE)
         self.said = widgets.HTML()
         self.map = self.anew = None
-        self._shown = scene
+        self._shown: Scene | None = scene
         # Verdicts are computed one at a time beside the pictures; only the last one requested is shown.
         self._worker = ThreadPoolExecutor(max_workers=1)
         self._pending: Future | None = None
@@ -119,6 +120,8 @@ class Explorer:
             scene = self.scene.replace(**{name: self._value(name) for name in self.sliders})
             run = simulate(scene, self.t1, 1 / rate, energy=True)
         except ValueError as error:
+            # A verdict that is still to come is of other values.
+            self._shown = None
             self.said.value = f"<i>{error}</i>"
             return
         self._shown = scene
@@ -159,7 +162,9 @@ class Explorer:
         self.update()
 
     def compute_map(self) -> None:
-        """Compute the map for the values of the sliders, over the same axes."""
+        """Compute the map for the values of the sliders, over the same axes; where these are refused, nothing is computed."""
+        if self._shown is None:
+            return
         self.anew.disabled, self.anew.description = True, "computing the map …"
         try:
             settings = json.loads(self._map.dataset.attrs.get("settings", "{}"))

@@ -45,7 +45,7 @@ def response(
     check_run(run)
     structure = run.scene.structure
     if coordinate is not None:
-        arguments.whole_number("coordinate", coordinate, minimum=0)
+        coordinate = arguments.whole_number("coordinate", coordinate, minimum=0)
         if coordinate >= structure.size:
             raise ValueError(f"Argument `coordinate` must be at most {structure.size - 1}, but is {coordinate}.")
     several = len(structure.contacts) > 1

@@ -73,11 +73,11 @@ class EventExact(AbstractStepper):
     def __init__(
         self, order: int = 20, tolerance: float = 1e-15, dt: float = math.inf, *, for_deviations: bool = False
     ):
-        arguments.whole_number("order", order, minimum=4)
+        order = arguments.whole_number("order", order, minimum=4)
         arguments.real_number("tolerance", tolerance, above=0)
         if not (isinstance(dt, float) and dt == math.inf):
             arguments.real_number("dt", dt, above=0)
-        self.order_ = int(order)
+        self.order_ = order
         self.tolerance = float(tolerance)
         self.dt = float(dt)
         self.for_deviations = bool(for_deviations)

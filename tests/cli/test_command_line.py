@@ -4,13 +4,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import xarray as xr
 
 import fivjax as fj
-from fivjax.cli import main
+from fivjax.cli import cycle_commands, main
 from fivjax.cli.analysis_commands import with_options
 from fivjax.cli.options import SceneOptions
 from fivjax.io.datasets import labelled
@@ -75,6 +76,20 @@ def test_a_map_without_any_verdict_is_a_failure(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(fj, "bistability_map", made_up_map([[-3, -3], [-3, -3]]))
     assert main(["map", "--x", "mu=0.1:0.2:2", "--y", "p=1:2:2", "--out", str(tmp_path / "map")]) == 1
     assert "No trajectory of the map could be followed: no equilibrium." in capsys.readouterr().err
+
+
+def test_a_cycle_without_a_saddle_is_written(monkeypatch, tmp_path, capsys):
+    """What was computed stays, although the other half of what was asked for does not exist."""
+    written = []
+    monkeypatch.setattr(fj, "limit_cycle", lambda scene: "the cycle")
+    monkeypatch.setattr(fj, "saddle_cycle", Mock(side_effect=fj.NoLimitCycle("There is no saddle.")))
+    monkeypatch.setattr(fj.plot, "cycle", lambda cycle, others: others)
+    for write in ("write_data", "write_picture"):
+        monkeypatch.setattr(cycle_commands, write, lambda what, path: written.append((what, path.name)))
+    assert main(["cycle", "--saddle", "--out", str(tmp_path / "own")]) == 1
+    assert written == [("the cycle", "own.nc"), ([], "own.png")]
+    said = capsys.readouterr()
+    assert "the cycle" in said.out and "There is no saddle." in said.err
 
 
 def test_friction_options():

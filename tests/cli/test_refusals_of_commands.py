@@ -133,6 +133,7 @@ def test_calibrate(folder, capsys, arguments, fragments):
         ),
         (["branch", "--over", "mu=0.1:0.3", "--each", "mu=0.1:0.2:2"], ["`--each`", "another parameter", "`mu`"]),
         (["branch", "--over", "mu=0.1:0.3", "--map", "mu=0.1:0.2:2"], ["`--map`", "another parameter", "`mu`"]),
+        (["branch", "--over", "mu=0.22:0.23", "--map", "p=1:2:20000"], ["400,000,000 trajectories", "Give fewer values"]),
         (["simulate", "--dt", "1e-5"], ["`--dt`", "`--method where-switched`"]),
         (["branch", "--over", "mu=0.2:0.22"], ["`bounds`", "0.227", "a scene whose mu lies between them"]),
         (["cea", "--x", "mu"], ["NAME=FROM:TO:COUNT", "'mu'"]),

@@ -48,7 +48,10 @@ def test_a_saved_cycle_comes_back_to_the_last_bit(cycle, saddle, tmp_path):
     """Also one that is unstable, which no search would find again."""
     for one in (cycle, saddle):
         fj.save(one, tmp_path / "cycle.nc")
-        found = fj.LimitCycle.from_dataset(fj.open(tmp_path / "cycle.nc"))
+        dataset = fj.open(tmp_path / "cycle.nc")
+        # Coordinates are names.
+        assert [name for name in dataset.variables if "units" not in dataset[name].attrs] == ["coordinate"]
+        found = fj.LimitCycle.from_dataset(dataset)
         assert (repr(found), found.word, repr(found.scene)) == (repr(one), one.word, repr(one.scene))
         for own, other in zip(jax.tree.leaves(one), jax.tree.leaves(found), strict=True):
             np.testing.assert_array_equal(own, other)
@@ -187,7 +190,8 @@ def test_above_the_speed_where_it_loses_stability_the_cycle_is_a_torus():
     peaks = {case["belt_speed"]: case["peak_speed"] for case in REFERENCE["paper"]["peaks"]}
     assert torus.amplitude == pytest.approx(peaks[3.0], rel=1e-4)
     assert 1 / torus.rotation_number == pytest.approx(14, abs=0.5)
-    assert abs(abs(torus.multipliers[0]) - 1) < 0.01 and abs(torus.multipliers[1]) < 0.99
+    # A mean over whole beats: with equal weights for all returns it was 2e-3.
+    assert abs(abs(torus.multipliers[0]) - 1) < 1e-3 and abs(torus.multipliers[1]) < 0.99
     # On some of the returns the contact sticks, which takes a direction away.
     assert np.all(torus.multipliers[2:] == 0) and "-∞, -∞ (the first is zero" in str(torus)
     # The curve's points, on cubics through their neighbours: half as many lie farther off, by the fourth power or so.

@@ -47,6 +47,7 @@ def test_what_cannot_be_reached_is_approached_as_far_as_the_bounds_go():
         ({"free": ["k1"], "bounds": {"k1": (1.0, 2.0)}}, "hold its own value"),
         ({"free": ["k1"], "bounds": {"k2": (9e4, 2e5)}}, "which is not free"),
         ({"free": ["k1"], "by": 0.0}, "must be positive"),
+        ({"free": ["k1"], "bounds": {"k1": (-9e4, 2e5)}}, "`k1` must be non-negative"),
     ],
 )
 def test_what_makes_no_sense_is_refused(options, sentence):
@@ -70,6 +71,16 @@ def test_a_kick_that_no_belt_speed_raises_further_is_said():
     raised = fj.design.raise_critical_perturbation(SCENE, 0.2, ["belt_speed"], p_range=(1.0, 1.4))
     assert not raised.reached and "Widen `bounds`" in str(raised)
     assert raised.after == pytest.approx(1.190283, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_a_step_to_what_no_scene_has_ends_the_search_and_loses_nothing():
+    """Less static friction raises the kick, but static friction below the dynamic one is refused: that was the end of the call."""
+    law = fj.ExponentialDecay(0.222, 0.221, 0.5)
+    raised = fj.design.raise_critical_perturbation(
+        SCENE.replace(friction=law, belt_speed=1.0), 0.2, ["mu_static"], p_range=(1.0, 2.0), steps=6
+    )
+    assert not raised.reached and "no scene has that (Argument `mu_static` must be at least" in raised.why
 
 
 @pytest.mark.slow

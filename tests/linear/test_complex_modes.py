@@ -242,13 +242,21 @@ def test_the_pencil_s_derivative_by_friction_where_tangents_are_not_at_right_ang
         np.testing.assert_allclose(getattr(slope, name).toarray(), difference.toarray(), atol=1e-8)
 
 
-def test_equal_eigenvalues_have_no_derivative_of_their_own():
-    """At a coalescence the left and right eigenvectors are at right angles: NaN, and no finite garbage."""
-    pencil = fj.cea.Pencil(np.eye(2), np.zeros((2, 2)), np.array([[1.0, 1.0], [0.0, 1.0]]))
-    slopes = fj.cea.eigenvalue_derivatives(
-        fj.cea.complex_modes(pencil), {"k": fj.cea.Pencil(0 * np.eye(2), 0 * np.eye(2), np.eye(2))}
-    )
-    assert np.all(np.isnan(slopes["k"]))
+@pytest.mark.parametrize(
+    ("damping", "stiffness"),
+    [
+        pytest.param(0 * np.eye(2), [[1.0, 1.0], [0.0, 1.0]], id="coalescence"),
+        pytest.param(0 * np.eye(2), 1e4 * np.eye(2), id="two equal oscillators"),
+        pytest.param(2 * np.eye(2), np.eye(2), id="critical damping"),
+    ],
+)
+def test_equal_eigenvalues_have_no_derivative_of_their_own(damping, stiffness):
+    """NaN, and no finite garbage: of equal oscillators any mixture is a mode, and the change decides which; at a coalescence and
+    at critical damping the left and right eigenvectors are at right angles."""
+    modes = fj.cea.complex_modes(fj.cea.Pencil(np.eye(2), damping, np.array(stiffness)))
+    change = fj.cea.Pencil(0 * np.eye(2), 0 * np.eye(2), np.diag([1.0, 0.0]))
+    slopes = fj.cea.eigenvalue_derivatives(modes, {"k": change})["k"]
+    assert np.all(np.isnan(slopes.real) & np.isnan(slopes.imag))
 
 
 def test_a_coordinate_without_mass_and_stiffness_is_refused():

@@ -155,6 +155,10 @@ BELT = fj.belt_oscillator()
             "`k1` is both in `bounds` and in `tied`",
         ),
         (
+            lambda: design.lower_growth_rate(BELT, {"k1": (1e5, 3e5)}, mu=0.2, tied={"m2": lambda own: 0 * own["k1"]}),
+            "`m2` must be positive, but is 0",
+        ),
+        (
             lambda: design.raise_critical_friction(BELT.replace(theta=0.0), {"k1": (1e5, 2e5)}),
             "the structure is never unstable",
         ),

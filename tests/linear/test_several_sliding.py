@@ -220,6 +220,10 @@ def test_a_chart_of_several_contacts_has_their_growth_rates():
     # On a belt that runs the other way, so much friction lifts one of them off.
     mixed = fj.cea.chart(scene.replace(belt_speed=-1.5), mu_static=[0.3, 1e3], force=force)
     assert np.isfinite(mixed["growth_rate"].values[0]).all() and np.isnan(mixed["growth_rate"].values[1]).all()
+    # So are frequencies: a picture has a gap there, and no fall to zero.
+    assert np.isnan(mixed["frequency"].values[1]).all()
+    falling = fj.cea.modes(fj.Scene(fj.belt_oscillator(), scene.friction, 1.5, scene.load), belt_speed=[-1.0, 0.0, 1.0])
+    assert np.isnan(falling["frequency"].values).all(axis=1).tolist() == [False, True, False]
     for function in (lambda: fj.cea.margin(structure, 0.2), lambda: fj.cea.coalescence(structure)):
         with pytest.raises(ValueError, match="takes structures with one contact, but this one has 2"):
             function()

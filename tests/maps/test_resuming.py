@@ -86,6 +86,14 @@ def test_axes_in_another_order_are_another_map(tmp_path, kind):
         fj.bistability_map(scene(), resume=path, progress=False, **dict(reversed(AXES.items())))
 
 
+def test_a_time_limit_is_a_number_whatever_library_made_it(tmp_path):
+    """1 is 1.0; and what was given as NumPy's or JAX's could not be written at all."""
+    path = tmp_path / "map.part"
+    first = kept(path, scene(), t_max=1.0)
+    for limit in (1, np.int64(1), np.float32(1.0), jnp.asarray(1.0)):
+        assert kept(path, scene(), t_max=limit).equals(first)
+
+
 @pytest.mark.parametrize(
     ("first", "second", "part"),
     [

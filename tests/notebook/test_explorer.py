@@ -210,11 +210,13 @@ def test_sliders_keep_their_width(explorer):
 
 
 def test_what_the_scene_refuses_is_said(explorer):
-    """No picture of an impossible scene: a sentence, and the last picture stays."""
-    before = explorer.picture.png
+    """No picture of an impossible scene: a sentence, and the last picture stays, also when the verdict of the last values comes."""
     slider = explorer.sliders["belt_speed"]
     slider.min, old = 0.0, slider.value
+    slider.value = old + 2 * slider.step
+    before = explorer.picture.png
     slider.value = 0.0
+    explorer.wait()
     assert "must not be zero" in explorer.said.value
     assert explorer.picture.png == before
     slider.value = old

@@ -694,6 +694,16 @@ def test_an_axis_without_end(tmp_path, capsys):
         lambda scene, mu: fj.cea.chart(scene.structure, mu=np.array([0.1, 0.2]), k1=mu * np.array([5e5, 6e5])),
         lambda scene, mu: fj.cea.coalescence(scene.structure.replace(c1=mu)),
         lambda scene, mu: fj.cea.sensitivity(scene.structure.replace(c1=mu)),
+        lambda scene, mu: fj.cea.complex_modes(scene.structure.replace(c1=mu), 0.2),
+        lambda scene, mu: fj.cea.friction_derivative(scene.structure, mu),
+        lambda scene, mu: fj.calibrate(
+            scene.replace(mu=mu), fj.Recording(1e-3 * np.arange(20), {"velocity 0": np.ones(20)}), ["mu"]
+        ),
+        lambda scene, mu: fj.tradeoff(scene.replace(mu=mu)),
+        lambda scene, mu: fj.explorer(scene.replace(mu=mu)),
+        lambda scene, mu: fj.design.raise_critical_friction(scene.structure.replace(c1=mu), {"k1": (9e4, 1.1e5)}),
+        lambda scene, mu: lower_growth_rate(scene.structure.replace(c1=mu), {"k1": (9e4, 1.1e5)}, mu=0.2),
+        lambda scene, mu: fj.design.search_critical_friction(scene.structure.replace(c1=mu)),
     ],
 )
 def test_a_scene_traced_by_jax_is_refused_in_a_sentence(paper_scene, call):
