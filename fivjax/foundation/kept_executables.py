@@ -45,6 +45,12 @@ def serialized(lowered, compiled) -> bytes:
         raise NotSerializable(str(error)) from None
 
 
+def know_what_it_calls(content: bytes) -> None:
+    """Register what a program calls of LAPACK, if it does: JAX 0.8 ends the process otherwise."""
+    if LAPACK.encode() in content:
+        register()
+
+
 def program_from(content: bytes) -> Callable[[Sequence], list[jax.Array]]:
     """A program from its bytes, as a function of all its arrays. The bytes must be what `serialized` gave, on such a machine.
 
@@ -53,8 +59,7 @@ def program_from(content: bytes) -> Callable[[Sequence], list[jax.Array]]:
     # In this version of JAX, where devices are listed is not public; another one raises, and the program is compiled anew.
     from jaxlib import xla_client
 
-    if LAPACK.encode() in content:
-        register()
+    know_what_it_calls(content)
     devices = xla_client.DeviceList(tuple(jax.devices()))
     executable = get_backend().deserialize_executable(content, devices, None)
 

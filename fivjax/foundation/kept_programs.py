@@ -31,7 +31,7 @@ import jax
 from .argument_forms import ArrayForm, Form
 from .compiling import compiled, quick_compiler_options, transformed
 from .forking import refuse_if_forked
-from .kept_executables import NotSerializable, can_serialize, program_from, serialized
+from .kept_executables import NotSerializable, can_serialize, know_what_it_calls, program_from, serialized
 from .kept_folder import folder_of_caches, folder_to_keep_in, keep, make_room, read_kept
 from .plain_trees import NotPlain, from_text, structure_to_text, to_text, with_zeros
 
@@ -128,6 +128,7 @@ def _program(function: Callable, form: Form, arrays: Sequence, quickly_compiled:
             return lambda arrays: jax.tree.unflatten(result, run(arrays))
         from jax import export
 
+        know_what_it_calls(program)
         exported = export.deserialize(bytearray(program))
         compiled = jax.jit(exported.call, compiler_options=options).lower(*arrays).compile()
         return lambda arrays: jax.tree.unflatten(result, compiled(*arrays))

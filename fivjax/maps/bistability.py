@@ -95,9 +95,9 @@ def bistability_map(
     Which attractor captured a trajectory is `attractor`, an index into the table over `attractors`; `chaotic` marks undecided
     trajectories from which neighbours diverge exponentially. With an axis p, `p_crit_low` and `p_crit_high` over the other axes
     are the two kicks between which the limit cycle first appears, one proved to slide and one proved to end on a limit cycle,
-    and `p_crit` is their middle, NaN if undecided kicks lie between; `critical_perturbation` narrows that down. With an axis
-    mu, the attribute `mu_crit` is the critical friction of linear theory. If no trajectory could be followed, all for the same
-    reason, the attribute `failure` says why.
+    and `p_crit` is their middle, NaN if undecided kicks lie between, or if already the first of the axis squeals (1 if that is
+    no kick, p = 1); `critical_perturbation` narrows that down. With an axis mu, the attribute `mu_crit` is the critical
+    friction of linear theory. If no trajectory could be followed, all for the same reason, the attribute `failure` says why.
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
     not increasing, values that the scene refuses, and a `resume` file that belongs to another run.

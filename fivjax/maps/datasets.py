@@ -113,8 +113,15 @@ def with_critical_kicks(dataset: xr.Dataset) -> xr.Dataset:
         return dataset[name].transpose(*others, "p").values.reshape(-1, len(p))
 
     computed = by_kick("computed") if "computed" in dataset else True
-    crossing, over = first_crossings(p, by_kick("verdict"), computed), [dataset.sizes[name] for name in others]
-    found = {"p_crit": crossing.middle, "p_crit_low": crossing.low, "p_crit_high": crossing.high}
+    verdicts, over = by_kick("verdict"), [dataset.sizes[name] for name in others]
+    crossing = first_crossings(p, verdicts, computed)
+    # Where already the first kick squeals, the critical one lies below it, unless that is none at all.
+    below = (verdicts[:, 0] == Verdict.LIMIT_CYCLE) & (p[0] > 1)
+    found = {
+        "p_crit": np.where(below, np.nan, crossing.middle),
+        "p_crit_low": crossing.low,
+        "p_crit_high": crossing.high,
+    }
     return dataset.assign(
         {name: label(xr.DataArray(values.reshape(over), dims=others, name=name)) for name, values in found.items()}
     )

@@ -110,7 +110,8 @@ class ConstantLoad(AbstractLoad):
 
     @property
     def jumps(self) -> Float[Array, " k"]:
-        return jnp.zeros((0,), self.force.dtype)
+        # In the precision of the force, whatever that of the caller is.
+        return jnp.ravel(self.force)[:0]
 
     @property
     def final(self) -> Float[Array, ""]:

@@ -44,6 +44,8 @@ def branch(
             raise ValueError(
                 "A branch has an axis `point`, but of this one a single point was selected; select by slices."
             )
+        if not one["amplitude"].size:
+            raise ValueError("A branch has points, but of this one none was selected.")
     names = {str(one.attrs["parameter"]) for one in several.values()}
     if len(names) > 1:
         raise ValueError(
@@ -90,15 +92,19 @@ def _lines(axes: Axes, one: xr.Dataset, colour: str) -> None:
     x, y, kinds = one["parameter"].values, one["amplitude"].values, _kinds(one)
     known = np.isfinite(y)
     x, y, kinds = x[known], y[known], kinds[known]
+    # A line through a single point cannot be seen.
+    marker = "o" if len(one["parameter"]) == 1 else None
     # The line from a point to the next has the style of the first of them.
     for kind, style in enumerate(STYLES):
         chosen = kinds == kind
         shown = chosen | np.append(False, chosen[:-1])
-        axes.plot(np.where(shown, x, np.nan), np.where(shown, y, np.nan), color=colour, ls=style, lw=THIN)
+        found = np.where(shown, x, np.nan), np.where(shown, y, np.nan)
+        axes.plot(*found, color=colour, ls=style, lw=THIN, marker=marker)
     order = np.argsort(one["parameter"].values, kind="stable")
     x, slides = one["parameter"].values[order], one["sliding_stable"].values[order]
     for is_stable, style in ((True, STYLES[0]), (False, STYLES[1])):
-        axes.plot(np.where(slides == is_stable, x, np.nan), np.zeros(len(x)), color=colour, ls=style, lw=THICK)
+        found = np.where(slides == is_stable, x, np.nan), np.zeros(len(x))
+        axes.plot(*found, color=colour, ls=style, lw=THICK, marker=marker)
 
 
 def _tori(axes: Axes, tori: xr.Dataset) -> list[Line2D]:

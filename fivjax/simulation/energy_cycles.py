@@ -28,6 +28,7 @@ from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
+from ..steppers.section import section_weights
 from . import energy as accounts
 from .energy import Energy, EnergyData, Ledger
 from .rows import after_jump
@@ -69,7 +70,7 @@ def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
         25
     """
     _check(run)
-    found, _ = _marks(run, "crossings")
+    found = _with_closed_ends(run, _marks(run, "crossings")[0])
     energy = _mechanical(run.scene, found)
     work = {**found.ledger.work.lines("work"), "contact_work": found.ledger.work.contact}
     lines = {
@@ -175,6 +176,26 @@ def _marks(run: Trajectory, counted: str) -> tuple[_Instant, np.ndarray]:
     begun, reached = (np.asarray(getattr(ledger, counted)) for ledger in (starts.ledger, found.ledger))
     wanted &= np.diff(reached, axis=1, prepend=begun[:, None]) > 0
     return jax.tree.map(lambda leaf: leaf[wanted], found), before[wanted]
+
+
+def _with_closed_ends(run: Trajectory, found: _Instant) -> _Instant:
+    """With the ends of a motion that is closed on the section, such as a limit cycle's: its start is no rise through zero, and
+    whether its end has become one is a matter of rounding.
+    """
+    rows = _row_instants(run)
+    tangential = contact_coordinates(run.scene.structure)[0]
+    weights = section_weights(len(run.scene.structure.contacts))
+    speed = np.asarray(run.velocity)[:, np.atleast_1d(tangential)] @ weights
+    size = np.max(np.abs(rows.y - rows.y[0]), axis=0)
+    on_section = np.all(np.abs(speed[[0, -1]]) <= 1e-9 * np.max(np.abs(speed)))
+    closes = np.all(np.abs(rows.y[-1] - rows.y[0]) <= 1e-6 * size)
+    if not (len(speed) > 2 and on_section and closes and speed[1] > 0 > speed[-2]):
+        return found
+    early, late = run.t[[0, -1]] + 1e-6 * (run.t[[1, -2]] - run.t[[0, -1]])
+    inside = (found.t > early) & (found.t < late)
+    first, last = (jax.tree.map(lambda leaf, at=at: np.asarray(leaf)[[at]], rows) for at in (0, -1))
+    between = jax.tree.map(lambda leaf: leaf[inside], found)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), first, between, last)
 
 
 def _find(args, numbers: Float[Array, " most"]):

@@ -265,6 +265,11 @@ def test_a_branch_is_drawn_and_saved(branch, cycle, tmp_path):
     texts = [text.get_text() for text in axes.get_legend().get_texts()]
     assert {"fold", "1 m/s", "again", "stable", "unstable"} <= set(texts)
     assert fj.show(branch).axes[0].get_xlabel() == axes.get_xlabel()
+    # A line through a single point cannot be seen.
+    (alone,) = fj.show(branch.isel(point=slice(1, 2))).axes
+    assert [line.get_marker() for line in alone.lines if np.any(np.isfinite(line.get_ydata()))].count("o") == 2
+    with pytest.raises(ValueError, match="none was selected"):
+        fj.show(branch.isel(point=slice(0, 0)))
     with pytest.raises(TypeError, match="continue_cycle"):
         fj.plot.branch(cycle)
 

@@ -311,6 +311,15 @@ def test_islands_are_reported():
     assert 3.0 < found["p_crit"].item() < 4.2
 
 
+def test_a_map_whose_lowest_kick_squeals_knows_no_critical_one():
+    """μ = 0.2 at 3 m/s: p_crit is 1.47, below an axis from 2 on. Where sliding is unstable, no kick is needed."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2))
+    above = fj.bistability_map(scene, mu=[0.2, 0.25], p=[2.0, 3.0], progress=False)
+    assert np.all(above["verdict"] == 1) and np.all(np.isnan(above["p_crit"])) and np.all(above["p_crit_high"] == 2.0)
+    whole = fj.bistability_map(scene, mu=[0.2, 0.25], p=[1.0, 2.0], progress=False)
+    assert whole["p_crit"].values.tolist() == [1.5, 1.0]
+
+
 def test_above_the_stability_limit_any_kick_will_do():
     """μ = 0.25: p_crit is the lower end of the range, 1."""
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.25), 3.0, fj.Pulse(100.0, 1.2))

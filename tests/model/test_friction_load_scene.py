@@ -4,6 +4,7 @@ import copy
 import math
 import pickle
 import re
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -191,6 +192,9 @@ def test_constant_load_never_changes():
         assert load.jumps.shape == (0,)
         assert {float(load(jnp.asarray(t))) for t in (-5.0, 0.0, 0.05, 100.0)} == {250.0}
         assert float(load.final) == 250.0
+    # Without a word also where the caller has single precision.
+    with warnings.catch_warnings(action="error"):
+        assert load.jumps.shape == (0,)
 
 
 def test_values_keep_double_precision_outside_x64():

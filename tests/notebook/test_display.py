@@ -69,6 +69,12 @@ def test_show_draws_what_has_a_picture(run, tmp_path):
         fj.show(xr.Dataset({"verdict": (("mu", "p"), np.zeros((2, 2)))}))
 
 
+def test_modes_at_one_value_are_points(scene):
+    """They were said to have no picture, although the function that draws them draws points."""
+    drawn = fj.show(fj.cea.modes(scene.structure, mu=[0.2], progress=False))
+    assert {line.get_marker() for line in drawn.axes[0].lines[:2]} == {"o"}
+
+
 def test_the_remedy_for_three_axes_works(a_map):
     """The remedy once named an axis that the map did not have."""
     assert isinstance(fj.show(a_map.isel(mu=0, k1=0)), Figure)
