@@ -68,6 +68,12 @@ class Mode(NamedTuple):
         """Whether a gap that closes ends the phase."""
         return self.ending != AT_SECTION and self.of_guard(self.ending)[0] == Status.DETACH
 
+    def rebounds_after(self, before: "Mode") -> bool:
+        """Whether it is the flight of a contact that the landing before has lifted, its own or another's."""
+        if not (self.lands and before.lands):
+            return False
+        return self.ending == before.ending or before.status[self.ending // 2] != Status.DETACH
+
     @property
     def contact(self) -> Contact:
         """As the physics has it: numbers for one contact, arrays for several."""
@@ -117,11 +123,8 @@ class Phases(NamedTuple):
 
     def lasting(self, shortest: float = SHORTEST_REBOUNDS[0]) -> list[int]:
         """The phases that are no rebounds shorter than this share of the period."""
-        least, modes = shortest * self.period, self.modes
-        rebounds = [
-            mode.lands and mode.ending == modes[k - 1].ending and modes[k - 1].lands for k, mode in enumerate(modes)
-        ]
-        return [k for k, h in enumerate(self.h) if not (rebounds[k] and h < least)]
+        least = shortest * self.period
+        return [k for k, h in enumerate(self.h) if not (h < least and self.modes[k].rebounds_after(self.modes[k - 1]))]
 
 
 class PhaseImages(NamedTuple):

@@ -195,3 +195,61 @@ def test_the_state_at_an_edge_of_static_friction_is_on_the_cycle():
     run = fj.simulate(scene, period, period / 64, y0=tuple(start))
     for own, reached in zip(start, (run.displacement[-1], run.velocity[-1]), strict=True):
         np.testing.assert_allclose(reached, own, atol=1e-6 * np.max(np.abs(own)))
+
+
+def test_a_flight_after_a_landing_that_lifted_another_contact_is_a_rebound():
+    """Of a contact that was on the belt before; one that flew already lands on its own account."""
+    lands_0, lands_1 = 0, 2
+    before = Mode((2, 1), (0.0, 1.0), lands_0)
+    assert Mode((1, 2), (1.0, 0.0), lands_1).rebounds_after(before)
+    assert Mode((2, 1), (0.0, 1.0), lands_0).rebounds_after(before)
+    assert not Mode((1, 2), (1.0, 0.0), lands_1).rebounds_after(before._replace(status=(2, 2)))
+    assert not Mode((1, 1), (1.0, 1.0), 3).rebounds_after(before)
+
+
+@pytest.mark.slow
+def test_a_branch_goes_on_where_two_contacts_land_in_turn_ever_sooner():
+    """Each landing lifts the other contact. The last flights take picoseconds, and where they end is rounding: it was said that
+    the contact modes change at the very start, and that no cycle goes on from there.
+    """
+    mass = [
+        [1.22, -0.0159, -0.143, -0.0563, 0.176, 0.0172],
+        [-0.0159, 1.6, 0.0113, -0.206, -0.032, 0.113],
+        [-0.143, 0.0113, 1.34, -0.0467, -0.139, 0.0158],
+        [-0.0563, -0.206, -0.0467, 1.99, -0.267, -0.014],
+        [0.176, -0.032, -0.139, -0.267, 1.72, 0.0929],
+        [0.0172, 0.113, 0.0158, -0.014, 0.0929, 0.444],
+    ]
+    damping = [
+        [0.294, 0.0357, 0.0249, 0.0112, 0.0167, -0.0739],
+        [0.0357, 0.274, 0.0456, 0.0118, 0.0241, -0.0252],
+        [0.0249, 0.0456, 0.143, 0.0355, -0.0169, -0.0267],
+        [0.0112, 0.0118, 0.0355, 0.195, -0.042, -0.0225],
+        [0.0167, 0.0241, -0.0169, -0.042, 0.254, 0.063],
+        [-0.0739, -0.0252, -0.0267, -0.0225, 0.063, 0.386],
+    ]
+    stiffness = [
+        [2970.0, 568.0, 420.0, 187.0, 233.0, 309.0],
+        [568.0, 4050.0, 719.0, 223.0, 386.0, -419.0],
+        [420.0, 719.0, 2010.0, 570.0, -243.0, -424.0],
+        [187.0, 223.0, 570.0, 2730.0, -615.0, -354.0],
+        [233.0, 386.0, -243.0, -615.0, 3710.0, 979.0],
+        [309.0, -419.0, -424.0, -354.0, 979.0, 4540.0],
+    ]
+    structure = fj.Structure(
+        *map(np.array, (mass, damping, stiffness)),
+        [-0.0922, 0, 0, -1, -1, -1],
+        contacts=[fj.ContactPoint(i, 3 + i) for i in range(3)],
+    )
+    laws = [fj.ExponentialDecay(0.561, 0.3206, 3.667), fj.ExponentialDecay(0.657, 0.375, 2.788)]
+    laws.append(fj.ExponentialDecay(0.419, 0.2392, 1.309))
+    scene = fj.Scene(structure, laws, 0.08206, fj.ConstantLoad(2.0))
+    y0 = [-6.62e-4, -1.04e-3, -8.14e-4, 3.28e-5, 0, 0, 0.0351, 0.0524, 0.0418, 2.65e-3, 0, 0]
+    cycle = fj.limit_cycle(scene, start=(y0, (2, 1, 1)))
+    assert min(phase.duration for phase in cycle.word) < 1e-9 * cycle.period
+    branch = fj.continue_cycle(scene, "decay_0", (3.6, 3.72), start=cycle)
+    assert branch["parameter"].values[[0, -1]].tolist() == [3.6, 3.72] and not any(branch["special"].values)
+    assert np.all(np.diff(branch["amplitude"]) > 0)
+    last = fj.limit_cycle(scene.replace(decay_0=3.72), start=(y0, (2, 1, 1)))
+    assert branch["amplitude"].values[-1] == pytest.approx(last.amplitude, rel=1e-8)
+    np.testing.assert_allclose(np.abs(branch["multipliers"].values[-1])[:3], np.abs(last.multipliers[1:4]), rtol=1e-5)
