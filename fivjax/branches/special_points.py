@@ -207,17 +207,10 @@ def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> st
 def without(phases: Phases, change: Change, count_left: int) -> Phases:
     """The phases without the vanishing one, and where it takes another with it, without that: so many."""
     count, i = len(phases.modes), change.phase
-    y, h = phases.y, phases.h
-    if not change.merges or count - count_left == 1:
-        keep = [j for j in range(count) if j != i]
-        h = h.copy()
-        if change.merges:
-            following = (i + 1) % count
-            y = y.copy()
-            y[following], h[following] = y[i], h[i] + h[following]
-        return Phases(tuple(phases.modes[j] for j in keep), y[keep], h[keep])
-    before, following = (i - 1) % count, (i + 1) % count
-    y, h = y.copy(), h.copy()
-    y[following], h[following] = y[before], h[before] + h[i] + h[following]
-    keep = [j for j in range(count) if j not in (i, before)]
+    gone = [(i - 1) % count, i] if change.merges and count - count_left > 1 else [i]
+    y, h = phases.y.copy(), phases.h.copy()
+    if change.merges:
+        following = (i + 1) % count
+        y[following], h[following] = y[gone[0]], h[following] + h[gone].sum()
+    keep = [j for j in range(count) if j not in gone]
     return Phases(tuple(phases.modes[j] for j in keep), y[keep], h[keep])

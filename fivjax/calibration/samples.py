@@ -5,8 +5,6 @@ both are exact however few there are. Through a low-pass the motion is first ave
 bandwidth, which keeps impulses and jumps whole, then filtered in the spectrum, and sampled.
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -17,23 +15,15 @@ from ..io.low_pass import bandwidth, memory
 from ..io.recordings import Averaged, Channel, Recording
 
 
-class LowPassGrid(NamedTuple):
-    """A low-pass on a grid of fine steps, from before the first block to after the last, so that it may ring."""
-
-    count: int
-    lead: float  # the beginning of the grid, s after that of the first block
-    step: float  # s
-    response: Complex[np.ndarray, " f"]  # for means over fine steps
-    picked: Int[np.ndarray, "B p"]  # the fine steps in whose middles the samples are
-
-
 class Sampled(eqx.Module):
-    """What is predicted of a motion for the blocks of one recording."""
+    """What is predicted of a motion for the blocks of one recording. Through a low-pass, blocks are the steps of a fine grid
+    from before the recording to after it, so that the filter may ring.
+    """
 
-    lead: Float[Array, ""]
+    lead: Float[Array, ""]  # when the first predicted block begins, s after the recording's first
     width: Float[Array, ""]  # of a predicted block, s
-    response: Complex[Array, " f"] | None
-    picked: Int[Array, "B p"] | None
+    response: Complex[Array, " f"] | None  # of the low-pass, for means over fine steps
+    picked: Int[Array, "B p"] | None  # the fine steps in whose middles the samples are
     count: int = eqx.field(static=True)  # of predicted blocks
     per_block: int = eqx.field(static=True)  # points in each
     averages: bool = eqx.field(static=True)
@@ -69,19 +59,10 @@ def sampled(recording: Recording, blocks: Averaged) -> Sampled:
     averages = recording.sampling == "averages"
     if recording.filter is None:
         return Sampled(jnp.zeros(()), jnp.asarray(width), None, None, count, blocks.per_block, averages)
-    grid = _through(recording, blocks)
-    return Sampled(
-        jnp.asarray(grid.lead),
-        jnp.asarray(grid.step),
-        jnp.asarray(grid.response),
-        jnp.asarray(grid.picked),
-        grid.count,
-        1,
-        True,
-    )
+    return _through(recording, blocks)
 
 
-def _through(recording: Recording, blocks: Averaged) -> LowPassGrid:
+def _through(recording: Recording, blocks: Averaged) -> Sampled:
     # Fine steps per period of the highest frequency that a filter lets through.
     fine = 16
     # The most fine steps for one sample.
@@ -100,5 +81,6 @@ def _through(recording: Recording, blocks: Averaged) -> LowPassGrid:
     factor = response(frequencies) / np.sinc(frequencies * step)
     if recording.sampling == "averages":
         factor = factor * np.sinc(frequencies * interval)
-    middles = ringing + finer // 2 + finer * np.arange(samples)
-    return LowPassGrid(count, -ringing * step, step, factor, middles.reshape(len(blocks.means), blocks.per_block))
+    middles = (ringing + finer // 2 + finer * np.arange(samples)).reshape(len(blocks.means), blocks.per_block)
+    lead, width, response, picked = map(jnp.asarray, (-ringing * step, step, factor, middles))
+    return Sampled(lead, width, response, picked, count, 1, True)

@@ -140,17 +140,10 @@ class Calibrate:
 
 def with_options(sentence: str) -> str:
     """A sentence of `read_recording` with its arguments replaced by the options that set them: `columns` by `--column`."""
-    options = {
-        "columns": "--column",
-        "units": "--unit",
-        "time": "--time",
-        "rate": "--rate",
-        "full_scale": "--full-scale",
-        "filter": "--filter",
-        "y0": "--y0",
-        "offset": "--offset",
-    }
+    names = "columns|units|time|rate|full_scale|filter|y0|offset"
     sentence = re.sub(
-        rf"\b(with|give|Argument) `({'|'.join(options)})`", lambda found: f"{found[1]} `{options[found[2]]}`", sentence
+        rf"\b(with|give|Argument) `({names})`",
+        lambda found: f"{found[1]} `--{found[2].removesuffix('s').replace('_', '-')}`",
+        sentence,
     )
     return sentence.replace("Argument `--", "Option `--")
