@@ -111,7 +111,7 @@ def continue_cycle(
     known = [name for name, value in final.parameters.items() if np.ndim(value) == 0]
     arguments.one_of("parameter", parameter, tuple(known))
     parameter = str(parameter)
-    low, high = _checked_bounds(bounds)
+    low, high = arguments.pair("bounds", bounds, "(0.02, 0.3)")
     check_corners(final, {parameter: np.array([low, high])})
     value = float(final.parameters[parameter])
     if not low <= value <= high:
@@ -212,15 +212,6 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
         values = values[np.argsort(-np.abs(values), kind="stable")]
         cycle = eqx.tree_at(lambda c: (c.multipliers, c.stable), cycle, (values, bool(row["stable"])))
     return cycle_in_own_coordinates(given, cycle)
-
-
-def _checked_bounds(bounds) -> tuple[float, float]:
-    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
-        raise ValueError(f"Argument `bounds` must be a pair of numbers, such as (0.02, 0.3), but is {bounds!r}.")
-    low, high = bounds
-    arguments.real_number("bounds[0]", low)
-    arguments.real_number("bounds[1]", high, above=float(low))
-    return float(low), float(high)
 
 
 def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":

@@ -90,6 +90,18 @@ def numeric_array(name: str, value) -> np.ndarray:
     return array
 
 
+def pair(name: str, value, example: str, *, minimum: float | None = None) -> tuple[float, float]:
+    """`value` as two numbers of Python's, if it holds two finite ones, the lower one first."""
+    known(name, value)
+    if np.shape(value) != (2,):
+        kind = ValueError if np.ndim(value) else TypeError
+        raise kind(f"Argument `{name}` must be two numbers, the lower one first, such as {example}, but is {value!r}.")
+    low, high = value
+    real_number(f"{name}[0]", low, minimum=minimum)
+    real_number(f"{name}[1]", high, above=float(low))
+    return float(low), float(high)
+
+
 def bounds_about(name: str, pair, own: float) -> np.ndarray:
     """The lowest and the highest value that the parameter `name` may take, between which its `own` value lies."""
     pair = numeric_array(f"bounds[{name!r}]", pair)

@@ -23,15 +23,10 @@ P_STEP = 0.01
 
 def checked_range(p_range, p_step: float | None) -> tuple[float, float, float, int]:
     """The ends of the range of p, the steps of its scan, and how many kicks there are in it."""
-    if not isinstance(p_range, tuple | list) or len(p_range) != 2:
-        kind = TypeError if not isinstance(p_range, tuple | list) else ValueError
-        raise kind(f"Argument `p_range` must be a pair of numbers, such as (1.0, 5.0), but is {p_range!r}.")
-    low, high = p_range
-    arguments.real_number("p_range[0]", low, minimum=0)
-    arguments.real_number("p_range[1]", high, above=low)
+    low, high = arguments.pair("p_range", p_range, "(1.0, 5.0)", minimum=0)
     if p_step is None:
-        p_step = min(P_STEP, float(high) - float(low))
-    arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
+        p_step = min(P_STEP, high - low)
+    arguments.real_number("p_step", p_step, above=0, maximum=high - low)
     # The last step is no longer than the others; by rounding alone there is none more.
     return low, high, p_step, math.ceil(min((high - low) / p_step, 1e15) * (1 - 1e-6)) + 1
 

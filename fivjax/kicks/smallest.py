@@ -190,12 +190,11 @@ def smallest_kick(
         raise ValueError(
             f"Argument `bounds` must name what of a kick is free ({', '.join(OF_KICK)}), but has {unknown[0]!r}."
         )
-    for name, pair in given.items():
-        _check_pair(name, pair)
+    given = {name: _bounds(name, pair) for name, pair in given.items()}
     shortest, longest = given["duration"] if "duration" in free else (own, own)
-    certified = 1.0 + certified_excess(scene, float(shortest), float(longest))
-    starts = _nominated(scene, float(shortest), float(longest)) if "duration" in free else np.array([own])
-    low, high, _, scanned = checked_range(tuple(map(float, given["p"])), p_step)
+    certified = 1.0 + certified_excess(scene, shortest, longest)
+    starts = _nominated(scene, shortest, longest) if "duration" in free else np.array([own])
+    low, high, _, scanned = checked_range(given["p"], p_step)
     check_size({"duration": starts, "p": range(scanned)})
     options = RunOptions("scan", progress=False, all_or_none=True)
     kicked = Kicked(scene, {"duration": starts}, EXACT_STEPPER, Limits(None), options, {})
@@ -210,7 +209,7 @@ def smallest_kick(
     tried = sorted((float(seen.middle[k]), float(starts[k]), int(k)) for k in known)[:descents]
     p, duration, best = tried[0]
     if "duration" in free:
-        p, duration = min(_descended(scene, q, d, float(shortest), float(longest)) for q, d, _ in tried)
+        p, duration = min(_descended(scene, q, d, shortest, longest) for q, d, _ in tried)
     at = critical_perturbation(
         scene, duration=[duration], p_range=(p - 1e-4, p + 1e-4), p_step=1e-4, derivatives=True, progress=False
     ).isel(duration=0)
@@ -235,16 +234,12 @@ def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], piec
     if not bounds:
         arguments.real_number("scene.load.duration", scene.load.duration, above=0)
         return smallest_of(Histories(scene, pieces, float(scene.load.duration)))
-    _check_pair("duration", bounds["duration"])
-    return smallest_of(Histories(scene, pieces, float(bounds["duration"][1])))
+    return smallest_of(Histories(scene, pieces, _bounds("duration", bounds["duration"])[1]))
 
 
-def _check_pair(name: str, pair) -> None:
-    """Refuse bounds that are not two numbers, the lower one first."""
-    if arguments.numeric_array(f"bounds[{name!r}]", pair).shape != (2,):
-        raise ValueError(f"Argument `bounds[{name!r}]` must be two numbers, the lower one first, but is {pair!r}.")
-    arguments.real_number(f"bounds[{name!r}][0]", pair[0], minimum=1 if name == "p" else 0)
-    arguments.real_number(f"bounds[{name!r}][1]", pair[1], above=float(pair[0]))
+def _bounds(name: str, pair) -> tuple[float, float]:
+    least, example = {"p": (1.0, "(1.0, 2.0)"), "duration": (0.0, "(0.0, 0.1)")}[name]
+    return arguments.pair(f"bounds[{name!r}]", pair, example, minimum=least)
 
 
 def _descended(scene: Scene, p: float, duration: float, shortest: float, longest: float) -> tuple[float, float]:

@@ -227,7 +227,7 @@ def test_what_is_no_parameter_or_no_bound_is_refused():
         fj.continue_cycle(scene, "p", (0.0, 1.0))
     with pytest.raises(ValueError, match="must hold the scene's own mu"):
         fj.continue_cycle(scene, "mu", (0.3, 0.4))
-    with pytest.raises(ValueError, match="pair of numbers"):
+    with pytest.raises(ValueError, match="must be two numbers"):
         fj.continue_cycle(scene, "mu", 0.3)
     # What no scene has is no part of a branch.
     with pytest.raises(ValueError, match=r"`restitution` must be non-negative, but is -0\.2"):

@@ -76,10 +76,8 @@ def test_a_kick_that_no_belt_speed_raises_further_is_said():
 @pytest.mark.slow
 def test_a_step_to_what_no_scene_has_ends_the_search_and_loses_nothing():
     """Less static friction raises the kick, but static friction below the dynamic one is refused: that was the end of the call."""
-    law = fj.ExponentialDecay(0.222, 0.221, 0.5)
-    raised = fj.design.raise_critical_perturbation(
-        SCENE.replace(friction=law, belt_speed=1.0), 0.2, ["mu_static"], p_range=(1.0, 2.0), steps=6
-    )
+    scene = fj.Scene(SCENE.structure, fj.ExponentialDecay(0.222, 0.221, 0.5), 1.0, SCENE.load)
+    raised = fj.design.raise_critical_perturbation(scene, 0.2, ["mu_static"], p_range=(1.0, 2.0), steps=6)
     assert not raised.reached and "no scene has that (Argument `mu_static` must be at least" in raised.why
 
 

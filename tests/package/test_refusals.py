@@ -402,7 +402,7 @@ def test_what_is_no_dictionary_of_bounds(paper_scene, given):
     ):
         with refused(TypeError, "`bounds`", "a dictionary"):
             call()
-    with refused(ValueError, "`bounds['p']`", "two numbers"):
+    with refused(TypeError, "`bounds['p']`", "two numbers"):
         fj.smallest_kick(paper_scene, bounds={"p": 3.0})
 
 
