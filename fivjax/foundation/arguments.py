@@ -94,8 +94,9 @@ def pair(name: str, value, example: str, *, minimum: float | None = None) -> tup
     """`value` as two numbers of Python's, if it holds two finite ones, the lower one first."""
     known(name, value)
     if np.shape(value) != (2,):
-        kind = ValueError if np.ndim(value) else TypeError
-        raise kind(f"Argument `{name}` must be two numbers, the lower one first, such as {example}, but is {value!r}.")
+        raise ValueError(
+            f"Argument `{name}` must be two numbers, the lower one first, such as {example}, but is {value!r}."
+        )
     low, high = value
     real_number(f"{name}[0]", low, minimum=minimum)
     real_number(f"{name}[1]", high, above=float(low))

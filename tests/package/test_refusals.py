@@ -202,7 +202,7 @@ def test_what_is_no_scene(function, scene):
         (dict(p_step=-0.1), ValueError, ["`p_step`", "positive", "-0.1"]),
         (dict(tolerance=0.0), ValueError, ["`tolerance`", "positive", "0"]),
         (dict(tolerance=None), TypeError, ["`tolerance`", "numeric", "None"]),
-        (dict(p_range=3.0), TypeError, ["p_range", "3"]),
+        (dict(p_range=3.0), ValueError, ["p_range", "3"]),
         (dict(p_range=(1.0, 2.0, 3.0)), ValueError, ["p_range", "3"]),
         (dict(p_range=(1.0, 1.2), p_step=1.0), ValueError, ["`p_step`", "1"]),
     ],
@@ -402,7 +402,7 @@ def test_what_is_no_dictionary_of_bounds(paper_scene, given):
     ):
         with refused(TypeError, "`bounds`", "a dictionary"):
             call()
-    with refused(TypeError, "`bounds['p']`", "two numbers"):
+    with refused(ValueError, "`bounds['p']`", "two numbers"):
         fj.smallest_kick(paper_scene, bounds={"p": 3.0})
 
 
