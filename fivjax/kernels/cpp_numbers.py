@@ -212,7 +212,9 @@ def of_known(equation, operands: list[Value]) -> list[Value]:
         np.array(part.tolist(), atom.aval.dtype).reshape(part.shape)
         for part, atom in zip(operands, equation.invars, strict=True)
     ]
-    return list(map(of_numbers, function_of(equation)(values)))
+    # As in JAX, what is no number comes without a warning.
+    with np.errstate(all="ignore"):
+        return list(map(of_numbers, function_of(equation)(values)))
 
 
 def fill_of(equation):
