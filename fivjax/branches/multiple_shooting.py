@@ -68,12 +68,6 @@ class Mode(NamedTuple):
         """Whether a gap that closes ends the phase."""
         return self.ending != AT_SECTION and self.of_guard(self.ending)[0] == Status.DETACH
 
-    def rebounds_after(self, before: "Mode") -> bool:
-        """Whether it is the flight of a contact that the landing before has lifted, its own or another's."""
-        if not (self.lands and before.lands):
-            return False
-        return self.ending == before.ending or before.status[self.ending // 2] != Status.DETACH
-
     @property
     def contact(self) -> Contact:
         """As the physics has it: numbers for one contact, arrays for several."""
@@ -123,8 +117,21 @@ class Phases(NamedTuple):
 
     def lasting(self, shortest: float = SHORTEST_REBOUNDS[0]) -> list[int]:
         """The phases that are no rebounds shorter than this share of the period."""
-        least = shortest * self.period
-        return [k for k, h in enumerate(self.h) if not (h < least and self.modes[k].rebounds_after(self.modes[k - 1]))]
+        return [k for k in range(len(self.h)) if not self._rebound(k) < shortest * self.period]
+
+    def _rebound(self, k: int) -> float:
+        """The duration of the flight at whose end a phase ends, if a landing has begun it: the contact's own, or one that has
+        lifted it. Infinite for any other phase.
+        """
+        modes, begun = self.modes, k - 1
+        if not modes[k].lands:
+            return np.inf
+        contact, ending = modes[k].ending // 2, modes[k].ending
+        while (
+            begun > k - len(modes) and modes[begun].ending != ending and modes[begun].status[contact] == Status.DETACH
+        ):
+            begun -= 1
+        return float(np.sum(self.h[np.arange(begun + 1, k + 1)])) if modes[begun].lands else np.inf
 
 
 class PhaseImages(NamedTuple):

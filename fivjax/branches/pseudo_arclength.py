@@ -182,10 +182,13 @@ def _least_solution(rows: Float[np.ndarray, "m-1 m"], right: Float[np.ndarray, "
 def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
     """The multiplicity of the root that the guard which ends a phase has at the phase's own start.
 
-    A slip speed after a reversal of slip has a simple root there, after sticking a double one; a gap after an impact a simple
-    one, after lift-off a triple one. A duration of zero would always solve their equations, so these roots are divided out.
+    A slip speed after a reversal of slip has a simple root there, after sticking a double one; a gap after an impact, its own
+    or one that has lifted it, a simple one, after lift-off a triple one. A duration of zero would always solve their equations,
+    so these roots are divided out.
     """
     before, own = modes[k - 1], modes[k]
+    if own.lands and before.lands and before.status[own.ending // 2] != Status.DETACH:
+        return 1
     if AT_SECTION in (before.ending, own.ending) or before.ending // 2 != own.ending // 2:
         # The mode of that contact has begun earlier.
         return 0

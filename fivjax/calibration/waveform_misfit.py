@@ -191,8 +191,8 @@ def misfit_of_waveform(recording: Recording, blocks: Averaged, method: AbstractS
     modes = scene.structure.size - len(scene.structure.contacts)
     found = strongest_poles(tail, width, modes, sigma)
     # Padded to the largest number of poles, so that all recordings of this length share compiled programs.
-    values = np.full(modes, np.nan, complex)
-    shapes = np.full((len(values), len(recording.channels)), np.nan, complex)
+    values = np.full(modes, complex(np.nan, np.nan))
+    shapes = np.full((len(values), len(recording.channels)), complex(np.nan, np.nan))
     if found.explained > least_explained:
         values[: len(found.values)], shapes[: len(found.values)] = found.values, found.shapes
     common: dict = {

@@ -164,7 +164,8 @@ def _struck(
         lifted = reached & (contact.status != Status.DETACH) & (own > 0)
         free = Contact(jnp.where(lifted, Status.DETACH, contact.status), contact.direction)
         rests = rests | (lifted & _ends_within(resolution, own, _fall(mechanics, free, load, y)))
-        # Its landing's impulse is more, by that which lifts it, than the force at rest that its flight is without.
+        # In truth it flies, without its force at rest, and lands by an impulse. The two differ by the impulse that would end
+        # the lift at once, friction included; with it, the mean forces are those of the flight.
         slip = relative_velocity(mechanics, y_struck)
         at_rest = rests | ((gap(mechanics, y_struck) <= 0) & (own == 0))
         of_rest = jnp.where(at_rest, jnp.where(slip == 0, Status.STICK, Status.SLIDE), Status.DETACH)

@@ -103,7 +103,8 @@ def raise_critical_perturbation(
     - `scene`, whose load is a `Pulse`.
     - `by`: the share by which p_crit is to rise; 0.2 means 1.2 times the value.
     - `free`: names of the parameters that may change; those of `bounds` unless given.
-    - `bounds`: lowest and highest value by name; from half to twice the scene's own value unless given.
+    - `bounds`: lowest and highest value by name; from half to twice the scene's own value unless given. Steps to what no scene
+      has are halved.
     - `p_range`, `p_step`: the range and the steps of the scan for p_crit, as in `critical_perturbation`. The range must contain
       the target.
     - `steps`: the largest number of scenes for which p_crit is computed.
@@ -270,7 +271,8 @@ def _checked(scene: Scene, by, free, bounds):
                 f"Parameter `{name}` is zero, so a relative change of it has no meaning. Leave it out of `free`."
             )
         pair = arguments.bounds_about(name, bounds.get(name, sorted((0.5 * own, 2 * own))), own)
-        for end in pair if name in bounds else ():
+        # Of several, what one may be depends on the others.
+        for end in pair if names == (name,) and bounds else ():
             scene.replace(**{name: float(end)})
         limits.append((pair - own) / abs(own))
     low, high = np.array(limits).T

@@ -186,10 +186,13 @@ class Histories:
         rates = np.asarray(self.sliding.modes.eigenvalues)
         edges, fastest = np.linspace(0.0, self.time, self.pieces + 1), np.max(np.abs(rates))
         periods = fastest * self.time / (2 * np.pi)
-        if FINE * periods > MOST_INSTANTS:
+        # Of each instant there is a number for each piece, of which there are 16 unless asked otherwise.
+        most = MOST_INSTANTS / FINE / max(1.0, self.pieces / 16)
+        if periods > most:
             raise ValueError(
-                f"A history of {self.time:g} s holds {periods:.0f} periods of the fastest mode, and a certified bound is known "
-                f"for up to {MOST_INSTANTS // FINE}. Shorten it, or leave out modes that are so fast."
+                f"A history of {self.time:g} s holds {periods:.0f} periods of the fastest mode, and a certified bound in "
+                f"{self.pieces} pieces is known for up to {most:.0f}. Shorten it, give fewer `pieces`, or leave out modes that "
+                "are so fast."
             )
         count = int(np.ceil(FINE * periods / self.pieces))
         inside = np.linspace(0.0, self.time / self.pieces, count + 1)

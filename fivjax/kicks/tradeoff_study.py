@@ -96,7 +96,7 @@ def tradeoff(
         ... )
     """
     methods = default_methods() if methods is None else methods
-    _check(scene, methods, t1, trajectories, boundary, refine)
+    trajectories, refine = _check(scene, methods, t1, trajectories, boundary, refine)
     precisions = _checked_precisions(precisions)
     frequency = _frequency(scene)
     rows = {(name, kind): method for (name, method), kind in itertools.product(methods.items(), precisions)}
@@ -187,7 +187,8 @@ def _checked_precisions(precisions) -> tuple[str, ...]:
     return names
 
 
-def _check(scene, methods, t1, trajectories, boundary, refine) -> None:
+def _check(scene, methods, t1, trajectories, boundary, refine) -> tuple[int, int]:
+    """The numbers of trajectories and of refinements, if all is in order."""
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     if not isinstance(methods, dict) or not methods:
@@ -205,6 +206,7 @@ def _check(scene, methods, t1, trajectories, boundary, refine) -> None:
         )
     if refine and np.ndim(scene.belt_speed):
         raise ValueError("Argument `refine` must be 0 for a scene whose contacts have belt speeds of their own.")
+    return trajectories, refine
 
 
 def _frequency(scene: Scene) -> float:

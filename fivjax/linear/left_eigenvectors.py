@@ -82,8 +82,8 @@ def eigenvectors(pencil: Pencil, value: complex) -> tuple[np.ndarray, np.ndarray
 
 
 def _size_of(pencil: Pencil, value: complex) -> float:
-    # Rigid-body motions, at zero, have no size of their own; that of the other eigenvalues is a measure.
-    return abs(value) or np.sqrt(abs(pencil.stiffness).sum() / abs(pencil.mass).sum())
+    # Rigid-body motions, at zero but for rounding, have no size of their own; that of the other eigenvalues is a measure.
+    return max(abs(value), 1e-6 * np.sqrt(abs(pencil.stiffness).sum() / abs(pencil.mass).sum()))
 
 
 def shape_basis(pencil: Pencil, *modes: ComplexModes, coordinates: int = 60) -> np.ndarray:

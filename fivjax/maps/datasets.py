@@ -116,7 +116,7 @@ def with_critical_kicks(dataset: xr.Dataset) -> xr.Dataset:
     verdicts, over = by_kick("verdict"), [dataset.sizes[name] for name in others]
     crossing = first_crossings(p, verdicts, computed)
     # Where already the first kick squeals, the critical one lies below it, unless that is none at all.
-    below = (verdicts[:, 0] == Verdict.LIMIT_CYCLE) & (p[0] > 1)
+    below = (verdicts[:, 0] == Verdict.LIMIT_CYCLE) & (p[0] != 1)
     found = {
         "p_crit": np.where(below, np.nan, crossing.middle),
         "p_crit_low": crossing.low,

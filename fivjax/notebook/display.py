@@ -90,7 +90,7 @@ _PICTURES = (
     (lambda d: "verdict" in d, plot.bistability),
     (lambda d: "special" in d and "word" in d, plot.branch),
     (lambda d: "crossings" in d and d["p_crit"].ndim == 1 and d["p_crit"].size > 1, plot.critical),
-    (lambda d: "damping_ratio" in d and d["frequency"].ndim == 2, plot_linear.eigenvalues),
+    (lambda d: "damping_ratio" in d and d["frequency"].ndim == 2 and d["frequency"].size, plot_linear.eigenvalues),
     (lambda d: "growth_rate" in d and "mode" not in d.dims and d["growth_rate"].ndim == 2, plot_linear.chart),
     (lambda d: "state_error" in d and "stepper" in d.dims, plot.tradeoff),
     (lambda d: "energy_gain" in d and "cycle" in d.dims and d.sizes["cycle"] > 0, plot_energy.per_cycle),

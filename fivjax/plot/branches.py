@@ -93,7 +93,7 @@ def _lines(axes: Axes, one: xr.Dataset, colour: str) -> None:
     known = np.isfinite(y)
     x, y, kinds = x[known], y[known], kinds[known]
     # A line through a single point cannot be seen.
-    marker = "o" if len(one["parameter"]) == 1 else None
+    marker = "o" if len(x) == 1 else None
     # The line from a point to the next has the style of the first of them.
     for kind, style in enumerate(STYLES):
         chosen = kinds == kind

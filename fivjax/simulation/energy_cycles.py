@@ -70,7 +70,7 @@ def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
         25
     """
     _check(run)
-    found = _with_closed_ends(run, _marks(run, "crossings")[0])
+    found = _with_ends(run, _marks(run, "crossings")[0])
     energy = _mechanical(run.scene, found)
     work = {**found.ledger.work.lines("work"), "contact_work": found.ledger.work.contact}
     lines = {
@@ -178,21 +178,22 @@ def _marks(run: Trajectory, counted: str) -> tuple[_Instant, np.ndarray]:
     return jax.tree.map(lambda leaf: leaf[wanted], found), before[wanted]
 
 
-def _with_closed_ends(run: Trajectory, found: _Instant) -> _Instant:
-    """With the ends of a motion that is closed on the section, such as a limit cycle's: its start is no rise through zero, and
-    whether its end has become one is a matter of rounding.
+def _with_ends(run: Trajectory, found: _Instant) -> _Instant:
+    """With the ends of a motion under a constant load that begins and ends on the section, as a limit cycle's own trajectory
+    does: its start is no rise through zero, and whether its end has become one is a matter of rounding.
     """
-    rows = _row_instants(run)
-    tangential = contact_coordinates(run.scene.structure)[0]
-    weights = section_weights(len(run.scene.structure.contacts))
-    speed = np.asarray(run.velocity)[:, np.atleast_1d(tangential)] @ weights
-    size = np.max(np.abs(rows.y - rows.y[0]), axis=0)
-    on_section = np.all(np.abs(speed[[0, -1]]) <= 1e-9 * np.max(np.abs(speed)))
-    closes = np.all(np.abs(rows.y[-1] - rows.y[0]) <= 1e-6 * size)
-    if not (len(speed) > 2 and on_section and closes and speed[1] > 0 > speed[-2]):
+    rows, scene = _row_instants(run), run.scene
+    weights = section_weights(len(scene.structure.contacts))
+    tangential = np.atleast_1d(contact_coordinates(scene.structure)[0])
+    speed, rise = (np.asarray(of)[[0, -1]][:, tangential] @ weights for of in (run.velocity, run.acceleration))
+    on_section = np.all(np.abs(speed) <= 1e-9 * np.max(np.abs(scene.belt_speed)))
+    # A motion that fades ends on the section, too, where it rises no more.
+    rises = np.all(rise > 1e-3 * np.max(np.abs(rise)))
+    jumps = np.asarray(scene.load.jumps)
+    if not (on_section and rises) or np.any((jumps >= run.t[0]) & (jumps <= run.t[-1])):
         return found
-    early, late = run.t[[0, -1]] + 1e-6 * (run.t[[1, -2]] - run.t[[0, -1]])
-    inside = (found.t > early) & (found.t < late)
+    near = 1e-6 * (run.t[[1, -1]] - run.t[[0, -2]])
+    inside = (found.t > run.t[0] + near[0]) & (found.t < run.t[-1] - near[1])
     first, last = (jax.tree.map(lambda leaf, at=at: np.asarray(leaf)[[at]], rows) for at in (0, -1))
     between = jax.tree.map(lambda leaf: leaf[inside], found)
     return jax.tree.map(lambda *parts: np.concatenate(parts), first, between, last)

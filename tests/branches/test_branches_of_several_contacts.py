@@ -199,12 +199,23 @@ def test_the_state_at_an_edge_of_static_friction_is_on_the_cycle():
 
 def test_a_flight_after_a_landing_that_lifted_another_contact_is_a_rebound():
     """Of a contact that was on the belt before; one that flew already lands on its own account."""
-    lands_0, lands_1 = 0, 2
-    before = Mode((2, 1), (0.0, 1.0), lands_0)
-    assert Mode((1, 2), (1.0, 0.0), lands_1).rebounds_after(before)
-    assert Mode((2, 1), (0.0, 1.0), lands_0).rebounds_after(before)
-    assert not Mode((1, 2), (1.0, 0.0), lands_1).rebounds_after(before._replace(status=(2, 2)))
-    assert not Mode((1, 1), (1.0, 1.0), 3).rebounds_after(before)
+    lands_0, lands_1, slip_ends_1 = 0, 2, 3
+
+    def lasting(*phases) -> list[int]:
+        """Of a cycle whose last phase is long, and in which the first contact begins in flight."""
+        modes, h = [Mode(status, (1.0, 1.0), ending) for status, ending, _ in phases], [one for *_, one in phases]
+        return Phases((*modes, mode(SLIDE, SLIDE, 1)), np.zeros((len(h) + 1, 12)), np.array([*h, 1.0])).lasting()
+
+    fall, short = ((2, 1), lands_0, 0.1), 1e-10
+    assert lasting(fall, ((1, 2), lands_1, short)) == [0, 2]
+    assert lasting(fall, ((2, 1), lands_0, short)) == [0, 2]
+    assert lasting(((2, 2), lands_0, 0.1), ((1, 2), lands_1, short)) == [0, 1, 2]
+    assert lasting(fall, ((1, 1), slip_ends_1, short)) == [0, 1, 2]
+    # While it is lifted, the other may rebound; what it is short of counts from where its flight begins.
+    assert lasting(fall, ((2, 2), lands_0, short), ((1, 2), lands_1, short)) == [0, 3]
+    assert lasting(fall, ((2, 2), lands_0, 0.1), ((1, 2), lands_1, short)) == [0, 1, 2, 3]
+    # A flight that another's landing begins has a gap of zero there.
+    assert roots_at_start((mode(DETACH, SLIDE, lands_0), mode(SLIDE, DETACH, lands_1)), 1) == 1
 
 
 @pytest.mark.slow

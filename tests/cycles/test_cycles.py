@@ -147,7 +147,7 @@ def test_energy_per_period_balances(cycle):
     assert gained == pytest.approx(lost, rel=1e-9)
     # Its periods are whole cycles of its trajectory, which begins and ends on the section: rounding left out the first, or two.
     for periods in (1, 3):
-        of_each = fj.energy_per_cycle(cycle.trajectory(100, periods=periods, energy=True))
+        of_each = fj.energy_per_cycle(cycle.trajectory(2 * periods, periods=periods, energy=True))
         np.testing.assert_allclose(of_each["damping_work"], periods * [energy["damping_work"]], rtol=1e-9)
 
 
