@@ -112,8 +112,8 @@ def raise_critical_perturbation(
     **Returns:** a `RaisedCriticalKick`; printing it says what was changed, and whether the target is reached.
 
     **Raises:** `ValueError` for names that are no scalar parameters of the scene, for parameters that are zero (they have no
-    relative change), for bounds that do not contain the scene's own value, and if there is no p_crit with derivatives to start
-    from.
+    relative change), for bounds that do not contain the scene's own value or, of a single parameter, that no scene has, and if
+    there is no p_crit with derivatives to start from.
 
     **Example:**
 
