@@ -94,10 +94,8 @@ def sliding_pencil(system: Structure | SparseStructure, mu, *, direction=1) -> P
 
 def friction_derivative(system: Structure | SparseStructure, mu, *, direction=1) -> Pencil:
     """The derivative of the sliding pencil at `mu`, by what is added to the friction coefficients of all contacts."""
-    bases, signs = (
-        _Bases.of(system),
-        signed_friction(system, np.ones_like(arguments.numeric_array("mu", mu)), direction),
-    )
+    bases = _Bases.of(system)
+    signs = signed_friction(system, np.ones_like(arguments.numeric_array("mu", mu)), direction)
     slope = bases.left_slope(signed_friction(system, mu, direction), signs)
     return Pencil(*(slope.T @ (matrix @ bases.right) for matrix in _sparse_matrices(system)))
 
