@@ -12,7 +12,7 @@ from ..attractors.cycles import FAMILY_TOLERANCE
 from ..contact import Contact, Status
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
-from ..io.datasets import named
+from ..io.datasets import label
 from ..model.load import ConstantLoad
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
@@ -28,21 +28,6 @@ if TYPE_CHECKING:
 MARGIN = 1e-9
 # What not every cycle has.
 OPTIONAL = ("rotation_number", "reach", "contraction")
-
-
-# Long names and units of what only files of cycles hold.
-OF_CYCLES = {
-    "multiplier_real": ("Floquet multiplier, real part", "1"),
-    "multiplier_imaginary": ("Floquet multiplier, imaginary part", "1"),
-    "harmonics_real": ("Fourier coefficient of the velocity, real part", "m/s"),
-    "harmonics_imaginary": ("Fourier coefficient of the velocity, imaginary part", "m/s"),
-    "section_point": ("state on the section: displacements, then velocities", "m, m/s"),
-    "section_status": ("contact status on the section (0 stick, 1 slide, 2 detach)", "1"),
-    "section_direction": ("direction of friction on the section", "1"),
-    "return_jacobian": ("derivative of the return by the state", "SI"),
-    "word_status": ("contact status of a phase (0 stick, 1 slide, 2 detach)", "1"),
-    "word_duration": ("duration of a phase", "s"),
-}
 
 
 class LimitCycle(eqx.Module):
@@ -176,19 +161,22 @@ class LimitCycle(eqx.Module):
         dataset = self.trajectory().to_dataset()
         each = ("contact",) * np.ndim(self.contact.status)
         optional = {name: getattr(self, name) for name in OPTIONAL}
-        dataset = dataset.assign(
-            multiplier_real=("multiplier", self.multipliers.real),
-            multiplier_imaginary=("multiplier", self.multipliers.imag),
-            harmonics_real=(("order", "coordinate"), self.harmonics.real),
-            harmonics_imaginary=(("order", "coordinate"), self.harmonics.imag),
-            section_point=(("point", "state"), np.asarray(self.points)),
-            section_status=(each, np.asarray(self.contact.status)),
-            section_direction=(each, np.asarray(self.contact.direction)),
-            return_jacobian=(("state", "before"), np.asarray(self.return_jacobian)),
-            word_status=(("phase", *each), np.array([phase.status for phase in self.word], int)),
-            word_duration=("phase", [phase.duration for phase in self.word]),
-        )
-        return named(dataset, **OF_CYCLES).assign_attrs(
+        own = {
+            "multiplier_real": ("multiplier", self.multipliers.real),
+            "multiplier_imaginary": ("multiplier", self.multipliers.imag),
+            "harmonics_real": (("order", "coordinate"), self.harmonics.real),
+            "harmonics_imaginary": (("order", "coordinate"), self.harmonics.imag),
+            "section_point": (("point", "state"), np.asarray(self.points)),
+            "section_status": (each, np.asarray(self.contact.status)),
+            "section_direction": (each, np.asarray(self.contact.direction)),
+            "return_jacobian": (("state", "before"), np.asarray(self.return_jacobian)),
+            "word_status": (("phase", *each), np.array([phase.status for phase in self.word], int)),
+            "word_duration": ("phase", [phase.duration for phase in self.word]),
+        }
+        dataset = dataset.assign(own)
+        for name in own:
+            label(dataset[name])
+        return dataset.assign_attrs(
             kind=self.kind,
             period=self.period,
             amplitude=self.amplitude,

@@ -271,10 +271,11 @@ def _checked(scene: Scene, by, free, bounds):
                 f"Parameter `{name}` is zero, so a relative change of it has no meaning. Leave it out of `free`."
             )
         pair = arguments.bounds_about(name, bounds.get(name, sorted((0.5 * own, 2 * own))), own)
-        # Of several, what one may be depends on the others.
-        for end in pair if names == (name,) and bounds else ():
-            scene.replace(**{name: float(end)})
         limits.append((pair - own) / abs(own))
+    # Of several, what one may be depends on the others.
+    if len(names) == 1:
+        for end in bounds.get(names[0], ()):
+            scene.replace(**{names[0]: float(end)})
     low, high = np.array(limits).T
     return names, start, low, high
 

@@ -110,8 +110,8 @@ class ConstantLoad(AbstractLoad):
 
     @property
     def jumps(self) -> Float[Array, " k"]:
-        # In the precision of the force, whatever that of the caller is, and without a derivative by it.
-        return jax.lax.stop_gradient(jnp.ravel(self.force)[:0])
+        # In the precision of the force, whatever that of the caller is, and nothing that depends on it.
+        return jnp.zeros_like(self.force, shape=(0,))
 
     @property
     def final(self) -> Float[Array, ""]:
@@ -171,9 +171,7 @@ class Pulse(AbstractLoad):
 
 def next_jump(load: AbstractLoad, t: Float[Array, ""]) -> Float[Array, ""]:
     """The first jump of the load after an instant (s); infinite where there is none."""
-    jumps = load.jumps
-    # Of no numbers the least has no derivative: it would be 0 / 0.
-    return jnp.min(jnp.where(jumps > t, jumps, jnp.inf), initial=jnp.inf) if jumps.size else jnp.full_like(t, jnp.inf)
+    return jnp.min(jnp.where(load.jumps > t, load.jumps, jnp.inf), initial=jnp.inf)
 
 
 def load_from(load: AbstractLoad, t: Float[Array, ""]) -> Float[Array, ""]:

@@ -182,7 +182,7 @@ def _with_ends(run: Trajectory, found: _Instant) -> _Instant:
     """With the ends of a motion under a constant load that begins and ends on the section, as a limit cycle's own trajectory
     does: its start is no rise through zero, and whether its end has become one is a matter of rounding.
     """
-    rows, scene = _row_instants(run), run.scene
+    scene = run.scene
     weights = section_weights(len(scene.structure.contacts))
     tangential = np.atleast_1d(contact_coordinates(scene.structure)[0])
     speed, rise = (np.asarray(of)[[0, -1]][:, tangential] @ weights for of in (run.velocity, run.acceleration))
@@ -192,6 +192,7 @@ def _with_ends(run: Trajectory, found: _Instant) -> _Instant:
     jumps = np.asarray(scene.load.jumps)
     if not (on_section and rises) or np.any((jumps >= run.t[0]) & (jumps <= run.t[-1])):
         return found
+    rows = _row_instants(run)
     near = 1e-6 * (run.t[[1, -1]] - run.t[[0, -2]])
     inside = (found.t > run.t[0] + near[0]) & (found.t < run.t[-1] - near[1])
     first, last = (jax.tree.map(lambda leaf, at=at: np.asarray(leaf)[[at]], rows) for at in (0, -1))

@@ -267,9 +267,8 @@ def test_a_branch_is_drawn_and_saved(branch, cycle, tmp_path):
     assert fj.show(branch).axes[0].get_xlabel() == axes.get_xlabel()
     # A line through a single point cannot be seen.
     (alone,) = fj.show(branch.isel(point=slice(1, 2))).axes
-    assert [line.get_marker() for line in alone.lines if np.any(np.isfinite(line.get_xydata()).all(axis=1))].count(
-        "o"
-    ) == 2
+    seen = [line for line in alone.lines if np.any(np.isfinite(line.get_xydata()).all(axis=1))]
+    assert [line.get_marker() for line in seen].count("o") == 2
     with pytest.raises(ValueError, match="none was selected"):
         fj.show(branch.isel(point=slice(0, 0)))
     with pytest.raises(TypeError, match="continue_cycle"):
