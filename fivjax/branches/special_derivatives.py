@@ -92,8 +92,8 @@ def _rebounds_change(special: Special) -> bool:
     """Whether a special point without restitution has no derivative by it, or none that is worked out.
 
     With a little restitution a landing that comes to rest does so by ever smaller rebounds, which are no phases here. What they
-    change of multipliers is not worked out; and where the landing is about to lift off again, a rebound grows from nothing to a
-    flight, and there is no such point.
+    change of multipliers is not worked out; and where a contact is about to lift off after the landing, its own or another's, a
+    rebound grows from nothing to a flight, and there is no such point.
     """
     modes = special.cycle.phases.modes
     if special.turns:
@@ -104,8 +104,7 @@ def _rebounds_change(special: Special) -> bool:
     if special.grazing is None:
         return False
     minimum = special.grazing.minimum
-    before = modes[minimum.phase - 1]
-    return minimum.time == 0 and before.lands and before.ending // 2 == minimum.guard // 2
+    return minimum.time == 0 and modes[minimum.phase - 1].lands
 
 
 def _of_stability_limit(family: Family, limit: float, name: str) -> float:

@@ -152,8 +152,8 @@ class Calibration(eqx.Module):
     __repr__ = __str__
 
     def to_dataset(self) -> xr.Dataset:
-        """Parameters with uncertainties, each with its `unit`; time offsets by recording, NaN where none was fitted; and the
-        data and the fit of recording r over `t_r` and `channel_r`, the channels with their `unit_r`.
+        """Parameters with uncertainties, each with its `unit`, and both as text; time offsets by recording, NaN where none was
+        fitted; and the data and the fit of recording r over `t_r` and `channel_r`, the channels with their `unit_r`.
         """
         offsets = np.array([(np.nan, np.nan) if offset is None else offset for offset in self.offsets]).reshape(-1, 2)
         dataset = xr.Dataset(
@@ -161,6 +161,7 @@ class Calibration(eqx.Module):
                 "value": ("parameter", np.array(list(self.values.values()))),
                 "uncertainty": ("parameter", np.array(list(self.uncertainty.values()))),
                 "identifiable": ("parameter", self.identified),
+                "value_text": ("parameter", list(map(self.value_text, self.names))),
                 "estimate": ("parameter", self.estimates),
                 "correlation": (("parameter", "other"), self.correlation),
                 "singular_value": ("direction", self.singular_values),
@@ -194,6 +195,7 @@ class Calibration(eqx.Module):
             "value": "value",
             "uncertainty": "standard deviation",
             "estimate": "value at the end",
+            "value_text": "value with its standard deviation",
         }.items():
             dataset[name].attrs.update(long_name=f"{what} of the parameter, in its unit")
         for name, what in {"offset": "time offset", "offset_uncertainty": "standard deviation of it"}.items():

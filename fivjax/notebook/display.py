@@ -28,8 +28,8 @@ def show(result, **options) -> Figure:
     """The picture of a result.
 
     **Arguments:** `result`, a `Trajectory`, a `LimitCycle` (one period), a map, basins, a critical perturbation, a branch, a
-    boundary section, modes, a stability chart, energies per cycle, sensitivities, a `tradeoff` or a `Calibration`; `options`
-    are those of the function of `fj.plot` that draws it.
+    boundary section, modes, a stability chart, energies per cycle, sensitivities, a `tradeoff`, a `Calibration` or the dataset
+    of one; `options` are those of the function of `fj.plot` that draws it.
 
     **Returns:** a matplotlib figure.
 
@@ -93,6 +93,7 @@ _PICTURES = (
     (lambda d: "damping_ratio" in d and d["frequency"].ndim == 2 and d["frequency"].size, plot_linear.eigenvalues),
     (lambda d: "growth_rate" in d and "mode" not in d.dims and d["growth_rate"].ndim == 2, plot_linear.chart),
     (lambda d: "state_error" in d and "stepper" in d.dims, plot.tradeoff),
+    (lambda d: "value_text" in d, plot.calibration),
     (lambda d: "energy_gain" in d and "cycle" in d.dims and d.sizes["cycle"] > 0, plot_energy.per_cycle),
 )
 

@@ -386,10 +386,15 @@ def test_result_is_written_and_drawn(decay_fit, tmp_path):
         assert dataset["unit"].values.tolist() == ["1", "N s/m", "N/m"] and set(dataset["unit_0"].values) == {"m/s2"}
         assert dataset["t_0"].attrs == {"long_name": "time, recording 0", "units": "s"}
         np.testing.assert_array_equal(dataset["offset"], decay_fit.offsets[0][:1] if decay_fit.offsets[0] else [np.nan])
-    figure = calibration(decay_fit)
+    figure, of_file = calibration(decay_fit), fj.show(fj.open(tmp_path / "fit.nc"))
     detail = figure.axes[0]
     np.testing.assert_array_equal(detail.lines[1].get_ydata(), decay_fit.fitted[0][:160, 0])
-    assert "mu = " in figure.get_suptitle()
+    assert "mu = " in figure.get_suptitle() and detail.get_ylabel().endswith("(m/s²)")
+    assert of_file.get_suptitle() == figure.get_suptitle()
+    for one, other in zip(figure.axes, of_file.axes, strict=True):
+        assert one.get_ylabel() == other.get_ylabel() and one.get_xlim() == other.get_xlim()
+        for a, b in zip(one.lines, other.lines, strict=True):
+            np.testing.assert_array_equal(a.get_xydata(), b.get_xydata())
     figure.draw_without_rendering()
 
 
