@@ -117,7 +117,8 @@ class Phases(NamedTuple):
 
     def lasting(self, shortest: float = SHORTEST_REBOUNDS[0]) -> list[int]:
         """The phases that are no rebounds shorter than this share of the period."""
-        return [k for k in range(len(self.h)) if not self._rebound(k) < shortest * self.period]
+        limit = shortest * self.period
+        return [k for k in range(len(self.h)) if not self._rebound(k) < limit]
 
     def _rebound(self, k: int) -> float:
         """The duration of the flight at whose end a phase ends, if a landing has begun it: the contact's own, or one that has

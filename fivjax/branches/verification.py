@@ -44,14 +44,15 @@ def real_motion(scene: Scene, phases: Phases) -> RealMotion | None:
         else _states(scene, phases, [LOOKS // 2])[longest]
     )
     seen = follow_period(scene, start, phases.period)
-    return RealMotion(start, seen, phases_around(seen.segments))
+    comes_around = abs(np.sum(seen.segments.h) - phases.period) <= 1e-9 * phases.period
+    return RealMotion(start, seen, phases_around(seen.segments) if comes_around else None)
 
 
 def amplitude(scene: Scene, phases: Phases, real: RealMotion) -> float:
     """The peak tangential speed (m/s) of a cycle: of its real motion; unless rounding makes that touch again and again where
     the cycle grazes, so that it comes to no end, or go another way where that is about to change. Then of the computed phases.
     """
-    if real.moves_as(phases) and abs(np.sum(real.seen.segments.h) - phases.period) <= 1e-9 * phases.period:
+    if real.moves_as(phases):
         return float(real.seen.amplitude)
     tangential, _ = contact_coordinates(scene.structure)
     places = scene.structure.size + np.atleast_1d(tangential)

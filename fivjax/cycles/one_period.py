@@ -97,7 +97,9 @@ def follow_period(scene: Scene, point: Point, period: float) -> PeriodSummary:
     most = least_segments
     while True:
         end, rows = _period(args, np.arange(float(most)), by_kernel=has_kernel(scene, EXACT_STEPPER))
-        if end.count < most or most >= MOST_SEGMENTS or not np.all(np.isfinite(end.y)):
+        # At rounding a motion may touch another mode again and again, and come no further.
+        stands_still = not np.any(rows.h[-least_segments // 2 :])
+        if end.count < most or most >= MOST_SEGMENTS or stands_still or not np.all(np.isfinite(end.y)):
             break
         most *= 4
     found = PeriodSegments(*jax.tree.map(lambda row: np.asarray(row)[: int(end.count)], rows))
