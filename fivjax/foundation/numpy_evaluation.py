@@ -1,6 +1,6 @@
 """A traced function computed by NumPy, equation by equation: for small functions of known values.
 
-XLA takes longer to compile such a function than NumPy takes for a hundred calls. Which equations there are is kept for later
+XLA takes longer to compile such a function than NumPy takes for some hundred calls. Which equations there are is kept for later
 processes (`numpy_plans`), because to trace the function takes longer still than to compute it.
 """
 
@@ -24,8 +24,10 @@ from .numpy_plans import NoSuchCase, NumpyPlan, numpy_plan_of
 from .plain_trees import NotPlain, from_text, structure_to_text
 from .precision import own_settings
 
-# Calls after which it is compiled, and results that are kept in case they are asked for again: few where they may be large.
-REPAID, LATEST, FEW = 100, 16, 2
+# Calls after which it is compiled: of the functions of a branch, 700 to 1,600 repay that, of others fewer or none.
+REPAID = 500
+# Results that are kept in case they are asked for again: few where they may be large.
+LATEST, FEW = 16, 2
 
 P = ParamSpec("P")
 R = TypeVar("R")
