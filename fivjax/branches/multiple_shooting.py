@@ -71,9 +71,7 @@ class Mode(NamedTuple):
     @property
     def contact(self) -> Contact:
         """As the physics has it: numbers for one contact, arrays for several."""
-        direction = [one if one else 1.0 for one in self.direction]
-        places = np.s_[0] if len(direction) == 1 else np.s_[:]
-        return Contact(np.array(self.status, np.int32)[places], np.array(direction)[places])
+        return jax.tree.map(lambda rows: rows[0], _contacts([self]))
 
 
 class Phases(NamedTuple):
@@ -232,8 +230,13 @@ class Ends(NamedTuple):
     following: Contact
 
 
-def _contacts(modes) -> Contact:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *[mode.contact for mode in modes])
+def _contacts(modes: Sequence[Mode]) -> Contact:
+    status, direction = (
+        np.array([mode.status for mode in modes], np.int32),
+        np.array([mode.direction for mode in modes]),
+    )
+    each = np.s_[:, 0] if status.shape[1] == 1 else np.s_[:]
+    return Contact(status[each], np.where(direction == 0, 1.0, direction)[each])
 
 
 def _filled(own, by_kernel: bool):

@@ -43,6 +43,7 @@ def silent() -> Iterator[None]:
         os.close(nowhere)
 
 
+@functools.cache
 def is_installed() -> bool:
     """Whether Warp can be imported."""
     return importlib.util.find_spec("warp") is not None
