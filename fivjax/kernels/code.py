@@ -211,7 +211,7 @@ def _given(writer: Writer, base: str, variables) -> list[Value]:
     """Arrays that are given, from one row of numbers in double precision."""
     found, start = [], 0
     for variable in variables:
-        shape, kind = variable.aval.shape, kind_of(variable.aval)
+        shape, kind = variable.aval.shape, kind_of(variable.aval, writer.lanes)
         view = View(base, (start,), shape, natural(shape), writer.types[base])
         start += view.size
         if kind == "double":

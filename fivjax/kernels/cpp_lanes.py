@@ -12,11 +12,13 @@ OF_LANES = {
     "double": REALS,
     "bool": TRUTHS,
     "int": WHOLES,
+    "signed char": WHOLES,
     "long long": WHOLES,
-    "unsigned": WHOLES,
-    "unsigned long long": WHOLES,
 }
 KINDS = (REALS, TRUTHS, WHOLES)
+# By how many bits whole numbers of lanes are longer than one lane's; and what may go beyond that one's.
+LONGER = {"int": 32, "signed char": 56}
+GOING_BEYOND = ("add", "add_any", "sub", "mul", "neg", "square", "integer_pow")
 # The primitives that are written in another way than for one lane.
 BY_NUMBER = {
     "sign": "sign({})",
@@ -85,6 +87,11 @@ static inline reals log(const reals x) {
 }
 }
 """
+
+
+def within_bits(form: str, kind: str) -> str:
+    """The form of a primitive whose result begins again at the other end where one lane's number of this type does."""
+    return f"((({form}) << (wholes)({LONGER[kind]})) >> (wholes)({LONGER[kind]}))" if kind in LONGER else form
 
 
 def declarations(lanes: int) -> str:

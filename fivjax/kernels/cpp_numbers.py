@@ -15,7 +15,7 @@ TYPES = {
     "float64": "double",
     "bool": "bool",
     "int32": "int",
-    "int8": "int",
+    "int8": "signed char",
     "int64": "long long",
     "uint32": "unsigned",
     "uint64": "unsigned long long",
@@ -87,22 +87,29 @@ WHOLE_REMAINDER = "({1} == 0 ? {0} : {0} % {1})", "((({1} == 0) & {0}) | ({0} % 
 WITHIN_WHOLE = {
     kind: f"({{0}} != {{0}} ? REAL(0) : ({{0}} > REAL({most}) ? REAL({most}) : "
     f"({{0}} < REAL({least}) ? REAL({least}) : {{0}})))"
-    for kind, least, most in (("int", -(2.0**31), 2.0**31 - 1), ("long long", -(2.0**63), 2.0**63 - 1024))
+    for kind, least, most in (
+        ("signed char", -128.0, 127.0),
+        ("int", -(2.0**31), 2.0**31 - 1),
+        ("long long", -(2.0**63), 2.0**63 - 1024),
+        ("unsigned", 0.0, 2.0**32 - 1),
+        ("unsigned long long", 0.0, 2.0**64 - 2048),
+    )
 }
 # What leaves each number as it is.
 SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
 COMPARISONS = ("lt", "le", "lt_to", "le_to", "gt", "ge", "eq", "ne", "is_finite")
 
 
-def kind_of(aval) -> str:
+def kind_of(aval, of_lanes: bool = False) -> str:
     """The type in C++ of numbers of an array.
 
-    **Raises:** `NotImplementedError` where there is none, as of numbers in single precision.
+    **Raises:** `NotImplementedError` where there is none, as of numbers in single precision; of lanes side by side, which
+    compare, divide and carry over numbers as those with a sign, none without.
     """
     if aval.dtype == jax.dtypes.float0:
         return "bool"
     name = np.dtype(aval.dtype).name
-    if name not in TYPES:
+    if name not in TYPES or (of_lanes and TYPES[name] not in cpp_lanes.OF_LANES):
         raise NotImplementedError(f"Numbers of type `{name}` have no C++ here; write the function without them.")
     return TYPES[name]
 
@@ -115,18 +122,31 @@ def text_of(entry) -> str:
     if isinstance(entry, float) and not np.isfinite(entry):
         return "(0.0 / 0.0)" if np.isnan(entry) else "(1.0 / 0.0)" if entry > 0 else "(-1.0 / 0.0)"
     if isinstance(entry, int) and abs(entry) >= 2**31:
-        return f"({entry}{'ull' if entry > 0 else 'll'})"
+        return f"({entry}{'ull' if entry >= 2**63 else 'll'})"
     return f"({entry!r})"
 
 
-def form_for(name: str, form: str, kind: str) -> str:
-    """The form of a primitive for numbers of a type; of two, the larger or smaller is no number where the first is none, as in
-    JAX.
-    """
+def form_for(name: str, form: str, own: str, of_lanes: bool) -> tuple[str, str]:
+    """The form of a primitive for numbers of a type, and this type, or that of all lanes' numbers."""
+    kind = cpp_lanes.OF_LANES.get(own, own) if of_lanes else own
+    form = _form_for(name, form, kind)
+    return (cpp_lanes.within_bits(form, own) if of_lanes and name in cpp_lanes.GOING_BEYOND else form), kind
+
+
+def form_before_conversion(own: str, kind: str, of_lanes: bool) -> str | None:
+    """What a number of a type is put through before it becomes one of another type, if anything."""
+    if own == "double" and kind in WITHIN_WHOLE:
+        return WITHIN_WHOLE[kind].replace("REAL", f"({cpp_lanes.REALS if of_lanes else 'double'})")
+    longer = cpp_lanes.LONGER.get(kind, 0) > cpp_lanes.LONGER.get(own, 0)
+    return cpp_lanes.within_bits("{}", kind) if of_lanes and longer and own not in ("double", "bool") else None
+
+
+def _form_for(name: str, form: str, kind: str) -> str:
+    # Of two, the larger or smaller is no number where the first is none, as in JAX.
     if name == "not" and kind not in ("bool", *cpp_lanes.KINDS):
         return "~{}"
-    if name == "abs" and kind == cpp_lanes.WHOLES:
-        return "({0} < (wholes)(0) ? -{0} : {0})"
+    if name == "abs" and kind not in ("double", WIDE, cpp_lanes.REALS):
+        return f"({{0}} < ({kind})(0) ? -{{0}} : {{0}})"
     if name in ("max", "min") and kind == cpp_lanes.REALS:
         return cpp_lanes.BY_NUMBER[name]
     return form.replace(" ?", " || {0} != {0} ?") if name in ("max", "min") and kind == "double" else form
@@ -179,9 +199,9 @@ def _is(entry, number: int) -> bool:
     return not isinstance(entry, str | bool) and entry == number
 
 
-def simpler(name: str, parts: list):
-    """What follows from the parts that are known, if anything does. Zero times something counts as zero: what is not a number
-    shows elsewhere.
+def simpler(name: str, parts: list, kind: str):
+    """What follows for a number of this type from the parts that are known, if anything does. Zero times something counts as
+    zero: what is not a number shows elsewhere.
     """
     if name == "select_n":
         which, first, second = parts
@@ -199,7 +219,7 @@ def simpler(name: str, parts: list):
             if isinstance(own, bool):
                 return other if own == (name == "and") else own
     if name == "sub" and isinstance(parts[0], str) and parts[0] == parts[1]:
-        return 0.0
+        return 0.0 if kind in ("double", WIDE, cpp_lanes.REALS) else 0
     if (name == "sub" and _is(parts[1], 0)) or (name == "div" and _is(parts[1], 1)):
         return parts[0]
     if name in ("div", "neg") and _is(parts[0], 0):

@@ -46,7 +46,7 @@ def _in_loops(writer: Writer, name: str, value: View, axes) -> Value:
 def _written_in_loops(writer: Writer, name: str, value: View, axes) -> View:
     kept = [axis for axis in range(value.ndim) if axis not in axes]
     into = writer.new([value.shape[axis] for axis in kept], value.kind)
-    form = form_for(name, BY_NUMBER[name], value.kind)
+    form, _ = form_for(name, BY_NUMBER[name], value.kind, False)
     outer = writer.loops(into.shape)
     total = writer.name(value.kind, "s")
     neutral = {"add": "0", "mul": "1", "and": "true", "or": "false"}.get(name)

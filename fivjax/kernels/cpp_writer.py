@@ -20,7 +20,7 @@ from ..foundation.jaxprs import within
 from . import cpp_lanes
 from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, has_known_numbers, natural, of_numbers
 from .cpp_fused import fused
-from .cpp_lanes import KINDS, OF_LANES, REALS
+from .cpp_lanes import KINDS, OF_LANES
 from .cpp_numbers import (
     BY_NUMBER,
     COMPARISONS,
@@ -28,8 +28,8 @@ from .cpp_numbers import (
     WHOLE_QUOTIENT,
     WHOLE_REMAINDER,
     WIDE,
-    WITHIN_WHOLE,
     converted,
+    form_before_conversion,
     form_for,
     kind_of,
     of_known,
@@ -247,14 +247,15 @@ class Writer:
             return list(map(self.small, found)) if primitive.multiple_results else [self.small(found)]
         if all(map(has_known_numbers, operands)) and sum(part.size for part in operands) < 4096:
             return of_known(equation, operands)
-        kinds = [kind_of(variable.aval) for variable in equation.outvars]
+        kinds = [kind_of(variable.aval, self.lanes) for variable in equation.outvars]
         if name in MOVING_ENTRIES and not (name == "concatenate" and any(isinstance(x, View) for x in operands)):
             return [MOVING_ENTRIES[name](*map(self.entries, operands), params)]
         if name in self.rules:
             return [self.rules[name](self, equation, operands, kinds[0])]
-        if name == "convert_element_type" and kinds[0] in WITHIN_WHOLE and kind_of(equation.invars[0].aval) == "double":
-            form = WITHIN_WHOLE[kinds[0]].replace("REAL", f"({REALS if self._any_wide_lanes(operands) else 'double'})")
-            operands = [self.each(name, form, operands, "double")]
+        if name == "convert_element_type":
+            own = kind_of(equation.invars[0].aval)
+            if (form := form_before_conversion(own, kinds[0], self._any_wide_lanes(operands))) is not None:
+                operands = [self.each(name, form, operands, own)]
         return [self.by_number(name, params, operands, kinds[0])]
 
     def by_number(self, name: str, params, operands: list[Value], kind: str) -> Value:
@@ -319,9 +320,7 @@ class Writer:
 
     def each(self, name: str, form: str, operands: Sequence[Value], kind: str) -> Value:
         """The same for each number."""
-        if self._any_wide_lanes(operands):
-            kind = OF_LANES.get(kind, kind)
-        form = form_for(name, form, kind)
+        form, kind = form_for(name, form, kind, self._any_wide_lanes(operands))
         shape = np.broadcast_shapes(*(part.shape for part in operands))
         if count_of(shape) > FEW and not all(map(has_known_numbers, operands)):
             return self._each_in_loops(name, form, operands, kind, shape)
@@ -375,7 +374,7 @@ class Writer:
 
     def one(self, name: str, form: str, parts: list, kind: str):
         """One number: its variable, or what it is known to be."""
-        known = simpler(name, parts)
+        known = simpler(name, parts, kind)
         if known is not None:
             return known
         texts = list(map(text_of, parts))

@@ -22,7 +22,7 @@ def time_unit(mechanics: Mechanics) -> Float[Array, ""]:
     rate = fastest_rate(mechanics)
     # The power of two below the rate is its exponent alone. Not by `jnp.frexp`: some versions of JAX lower that after double
     # precision has been switched off again.
-    bits = jnp.uint64 if rate.dtype == jnp.float64 else jnp.uint32
+    bits = jnp.int64 if rate.dtype == jnp.float64 else jnp.int32
     exponent = jax.lax.bitcast_convert_type(jnp.array(jnp.inf, rate.dtype), bits)
     below = jax.lax.bitcast_convert_type(jax.lax.bitcast_convert_type(rate, bits) & exponent, rate.dtype)
     return jnp.where((below > 0) & jnp.isfinite(below), 0.5 / below, 1.0)

@@ -100,7 +100,7 @@ def test_lanes_side_by_side_are_what_they_are_alone(size):
 
 def by_numbers(args, instants):
     x, y = args
-    bits = functools.partial(jax.lax.bitcast_convert_type, new_dtype=jnp.uint64)
+    bits = functools.partial(jax.lax.bitcast_convert_type, new_dtype=jnp.int64)
     whole, true = jnp.round(jnp.where(jnp.isfinite(x), 3 * jnp.tanh(x), 0.0)).astype(jnp.int32), x > y
     return {
         "smooth": [
@@ -176,6 +176,7 @@ def test_functions_of_lanes_side_by_side_are_those_of_jax():
     ]
     form = Form.of((rows[0, :3], rows[0, 3:]))[0]
     found, _ = kernel.of_many(form, rows, side_by_side=True)
+    assert kernel_of(kernel, form.kept, side_by_side=True).of_lanes.side_by_side > 1
     with jax.enable_x64(True):
         expected, _ = jax.jit(jax.vmap(lambda row: by_numbers((row[:3], row[3:]), None)))(rows)
     for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
@@ -442,6 +443,37 @@ def of_whole_numbers(args, instants):
         "between": jax.lax.clamp(y[0], x, y[1]),
         "cases": jnp.select([y > 1, y > 0, y > -1], [y**2, jnp.sin(y), x[0] + y], 7.0),
     }, ()
+
+
+def of_large_numbers(args, instants):
+    x, y = (jnp.floor(own).astype(jnp.int64) for own in args)
+    most, few = 3_000_000_000, [(100 * own).astype(jnp.int8) for own in (x, y)]
+    return {
+        "beyond 31 bits": [x < most, jnp.minimum(x, most), x // most, jnp.remainder(x, most), x * most],
+        "beyond 53 bits": jnp.abs(x - 2**53) - 2**53,
+        "of equal ones": [(x - x) & y, jax.lax.rem(x - x, y)],
+        "of 8 bits": [*few, few[0] + few[1], few[0] * few[1], -few[0], args[0].astype(jnp.int8)],
+        "of 32 bits": [(x * most).astype(jnp.int32), x.astype(jnp.int32) * 1_000_003 + y.astype(jnp.int32) * 10**9],
+    }, ()
+
+
+def without_sign(args, instants):
+    x, y = (own.astype(jnp.uint32) for own in args)
+    return [x * jnp.uint32(2_654_435_761) + y, x < y - 1, args[0].astype(jnp.uint64)], ()
+
+
+@pytest.mark.parametrize(("function", "as_vectors"), [(of_large_numbers, True), (without_sign, False)])
+def test_whole_numbers_of_any_size_are_as_in_jax(function, as_vectors):
+    """Also where they begin again at the other end. Without a sign they have no code side by side."""
+    rows = np.array([[-5.0, 3.0], [70_000.0, -2.0], [300.0, 5.0], [-1.5, 1.0], [4e9, -3.0], [0.0, 1e6]])
+    kernel, form = KernelFunction(function), Form.of((rows[0, 0], rows[0, 1]))[0]
+    with jax.enable_x64(True):
+        expected = jax.vmap(lambda row: function((row[0], row[1]), None)[0])(jnp.asarray(rows))
+    for side_by_side in (False, True):
+        found, _ = kernel.of_many(form, rows, side_by_side=side_by_side)
+        for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_array_equal(own, other)
+    assert (kernel_of(kernel, form.kept, side_by_side=True).of_lanes.side_by_side > 1) == as_vectors
 
 
 def test_whole_numbers_and_bounds_of_which_the_lower_is_above_the_upper_are_as_in_jax():
