@@ -18,6 +18,8 @@ HALVINGS = 5
 CLOSED = 1e-10
 # A cycle that was closed over several of its periods returns so nearly after one, where it is hardly stable.
 NEARLY = 1e-7
+# Where displacements are so many times as large as velocities, in energy, it is looked whether these return, too.
+FAR = 1e6
 # Newton's method stops when the distance no longer falls, or is below this.
 EXACT = 2e-15
 
@@ -93,7 +95,26 @@ def close(maps: ReturnMaps, group: Int[np.ndarray, " m"], guess: Section, crossi
             rows = rows[closed]
             best.crossings[rows], best.period[rows], best.jacobian[rows] = count, time[closed], derived[closed]
             best.residual[rows], open_[rows] = missed[closed], False
+    best.residual[_lost_velocities(maps, group, best)] = np.inf
     return best
+
+
+def _lost_velocities(maps: ReturnMaps, group, closed: Closed) -> Int[np.ndarray, " k"]:
+    """The rows whose velocities do not return, but are lost in the rounding of displacements: along what nothing holds back in
+    flight, Newton's method may come to where these are larger without measure.
+    """
+    n = len(maps.weights) // 2
+    displacements, velocities = (
+        np.linalg.norm(maps.weights[part] * closed.at.y[:, part], axis=1) for part in (np.s_[:n], np.s_[n:])
+    )
+    rows = np.flatnonzero(closed.found & (displacements > FAR * velocities))
+    if not len(rows):
+        return rows
+    at = closed.at.rows(rows)
+    images = maps.returns(group[rows], at, closed.crossings[rows], peaks=True)
+    missed = np.linalg.norm(maps.weights[n:] * (images.at.y - at.y)[:, n:], axis=1)
+    fastest = np.max(maps.weights[n + np.atleast_1d(maps.tangential)]) * images.peak
+    return rows[~(missed <= fastest / FAR)]
 
 
 def close_near(maps: ReturnMaps, guess: Point, crossings: int) -> FixedPoint | None:

@@ -108,7 +108,8 @@ class LimitCycle(eqx.Module):
         return bool(np.any(np.abs(across - 1.0) < FAMILY_TOLERANCE))
 
     def trajectory(self, points: int = 1000, *, periods: int = 1, energy: bool = False) -> Trajectory:
-        """One period, or several, as a trajectory of `points` + 1 rows, the first and the last on the section.
+        """One period, or several, as a trajectory of `points` + 1 rows, the first and the last on the section: where an impact
+        leads to it, the first is just after that, and the last just before.
 
         **Raises:** `ValueError` for a number of points that is not positive.
         """
@@ -191,10 +192,12 @@ class LimitCycle(eqx.Module):
         """Energy per period by line of the ledger, in J: work of the contact, the dampers and the load, and the loss in
         impacts.
         """
-        ledger = self.trajectory(64, energy=True).energy
+        # An impact may lead to the section, so that a period is taken which neither begins nor ends there.
+        points, begin = 64, 23
+        ledger = self.trajectory(2 * points, periods=2, energy=True).energy
         assert ledger is not None
-        lines = {name: float(np.asarray(line)[-1]) for name, line in ledger.work.lines("work").items()}
-        return {**lines, "impact_loss": float(np.asarray(ledger.impact)[-1])}
+        lines = {**ledger.work.lines("work"), "impact_loss": ledger.impact}
+        return {name: float(line[begin + points] - line[begin]) for name, line in lines.items()}
 
     def __str__(self) -> str:
         # So many phases of the word are printed.

@@ -33,8 +33,10 @@ Returned = Array | np.ndarray
 
 @contextlib.contextmanager
 def own_settings() -> Iterator[None]:
-    """Double precision, and arrays of any rank together, whatever the caller has set. Each thread has settings of its own."""
-    with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):
+    """Double precision, and arrays of any rank and type together, whatever the caller has set. Each thread has settings of its
+    own.
+    """
+    with jax.enable_x64(True), jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         yield
 
 

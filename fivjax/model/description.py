@@ -252,6 +252,8 @@ def _part(kind: type, what: str, name: str, parameters: Mapping, saved: Mapping 
             f"The scene's {what} is a `{name}`, which is not defined here. Import or define that class first, then ask again."
         )
     known = {**(saved["fields"] if saved else {}), **parameters}
+    # Arrays come from a file as lists, which the class's own code need not take.
+    known = {key: np.asarray(value) if isinstance(value, list) else value for key, value in known.items()}
     own = {field.name: known[field.name] for field in dataclasses.fields(found) if field.name in known}
     try:
         made = found(**own)
@@ -261,7 +263,11 @@ def _part(kind: type, what: str, name: str, parameters: Mapping, saved: Mapping 
             f"fields by name; or build the scene by hand."
         ) from None
     before, now = saved and saved["values"], saved and _values_of(made)
-    if before and now and not np.allclose(before, now, rtol=1e-9, atol=0.0, equal_nan=True):
+    if (
+        before
+        and now
+        and not (np.shape(before) == np.shape(now) and np.allclose(before, now, rtol=1e-9, atol=0.0, equal_nan=True))
+    ):
         raise ValueError(
             f"The scene's {what} is a `{name}`, but the class of that name computes something else now. Define the class as it "
             f"was, or build the scene by hand."

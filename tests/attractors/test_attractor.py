@@ -522,7 +522,7 @@ class Locked:
         after[:, 0], after[:, 1] = 4 + radius * np.cos(phase), radius * np.sin(phase)
         return after
 
-    def returns(self, group, at, crossings, kept=1):
+    def returns(self, group, at, crossings, kept=1, peaks=False):
         crossings = np.broadcast_to(crossings, len(group))
         path = [at.y]
         for count in range(int(np.max(crossings))):

@@ -151,6 +151,37 @@ def test_energy_per_period_balances(cycle):
         np.testing.assert_allclose(of_each["damping_work"], periods * [energy["damping_work"]], rtol=1e-9)
 
 
+@pytest.mark.parametrize("restitution", [0.0, 0.3])
+def test_energy_per_period_has_the_impact_that_leads_to_the_section(restitution):
+    """A trajectory over the period begins just after it and ends just before it. What the masses lose in it is taken by hand."""
+    if restitution:
+        structure = fj.belt_oscillator(theta=0.417, k2=110.7e3, c1=1.5, c2=3.33)
+        scene = fj.Scene(structure, fj.Coulomb(0.725, 0.942), 0.278, fj.ConstantLoad(91.6), restitution=restitution)
+    else:
+        structure = fj.belt_oscillator(theta=0.12, k2=133.4e3, c1=3.5, c2=4.9)
+        scene = fj.Scene(structure, fj.Coulomb(0.318), 0.995, fj.ConstantLoad(113.8))
+    cycle = fj.limit_cycle(scene)
+    run = cycle.trajectory(64)
+    before, after = run.velocity[-1], run.velocity[0]
+    # It jumps from below zero to above it.
+    assert before[0] < -0.03 and after[0] > 0.03
+    mass = np.asarray(structure.matrices.mass)
+    at_section = 0.5 * (before @ mass @ before - after @ mass @ after)
+    energy, others = cycle.energy, float(cycle.trajectory(64, energy=True).energy.impact[-1])
+    gained = energy["stick_work"] + energy["slide_work"] + energy["load_work"]
+    assert gained == pytest.approx(energy["damping_work"] + energy["impact_loss"], rel=1e-9)
+    assert energy["impact_loss"] == pytest.approx(others + at_section, rel=1e-9) and at_section > 0.1
+
+
+def test_a_flight_beyond_all_measure_is_no_cycle():
+    """Nothing holds it back along one direction: 1e14 m away the motion seemed to return, to 1e-16 of that."""
+    structure = fj.belt_oscillator(theta=0.39, k2=123e3, c1=3.97, c2=2.26)
+    scene = fj.Scene(structure, fj.Coulomb(0.703), 1.41, fj.ConstantLoad(99.2))
+    start = [0.0077, 0.0126, 0.0098, -0.7825, -3.553, -4.0105], fj.Status.DETACH
+    with pytest.raises(fj.NoLimitCycle, match="did not close a cycle near it"):
+        fj.limit_cycle(scene, start=start)
+
+
 def test_multipliers_are_those_of_differences(cycle):
     """A trajectory beside the cycle approaches it at the rate of the largest multiplier but one, return by return."""
     apart = cycle.deviation * 1e-6
@@ -466,7 +497,7 @@ def test_a_step_that_leads_where_there_is_no_return_is_halved(patient):
         tangential=0,
         normal=0,
     )
-    starts = np.array([[2.5, 0.0], [0.5, 0.0]])
+    starts = np.array([[2.5, 1.0], [0.5, 1.0]])
     guess = Section(starts, np.full(2, fj.Status.DETACH, np.int32), np.ones(2))
     closed = close(maps, np.zeros(2, int), guess, 1, patient)  # type: ignore[arg-type]
     assert closed.found.tolist() == [True, False]
