@@ -494,10 +494,12 @@ def test_a_step_that_leads_where_there_is_no_return_is_halved(patient):
         weights=np.ones(2),
         structure=SimpleNamespace(contacts=[None]),
         derived=derived,
+        # It is at rest, as far as velocities go.
+        returns=lambda group, at, crossings, peaks: SimpleNamespace(at=at, peak=np.zeros(len(group))),
         tangential=0,
         normal=0,
     )
-    starts = np.array([[2.5, 1.0], [0.5, 1.0]])
+    starts = np.array([[2.5, 0.0], [0.5, 0.0]])
     guess = Section(starts, np.full(2, fj.Status.DETACH, np.int32), np.ones(2))
     closed = close(maps, np.zeros(2, int), guess, 1, patient)  # type: ignore[arg-type]
     assert closed.found.tolist() == [True, False]
