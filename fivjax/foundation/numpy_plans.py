@@ -75,7 +75,9 @@ def numpy_plan_of(traced: ClosedJaxpr) -> dict[str, Any]:
     """The plan of a traced function. What follows from constants alone is computed now, what is the same wherever it stands is
     computed once, and what is called is part of the plan.
     """
-    return _Planner(traced.jaxpr, traced.consts).plan()
+    # As in JAX, what is no number comes without a warning.
+    with np.errstate(all="ignore"):
+        return _Planner(traced.jaxpr, traced.consts).plan()
 
 
 class _Planner:

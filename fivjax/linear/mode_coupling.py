@@ -88,7 +88,8 @@ def coalescence(structure: Structure, *, damped: bool = False, direction: int = 
     arguments.known("structure", structure)
     structure = in_contact_coordinates(structure)
     refuse_several_contacts(structure, "`coalescence`", "`growth_rate` takes several.")
-    arguments.instance("damped", damped, bool, "True or False")
+    arguments.truth("damped", damped)
+    damped = bool(damped)
     direction = checked_direction(direction)
     mu, omega, damped_mu, s, found, kept = jax.tree.map(
         np.asarray, _coalescence(matrices_only(structure), jnp.asarray(float(direction)))

@@ -83,11 +83,16 @@ def modes(system: Structure | Scene, *, direction: int = 1, progress: bool | Non
 
 
 def _limits(scene: Scene, direction: int) -> dict:
-    limit = stability_limit(scene.structure, direction=direction)
-    said = {"outcome": limit.outcome.value, "mechanism": limit.mechanism.value}
+    try:
+        limit = stability_limit(scene.structure, direction=direction)
+    except ValueError as error:  # at some friction nothing slides steadily
+        mu, frequency, said = np.nan, np.nan, {"outcome": str(error)}
+    else:
+        mu, frequency = limit.mu, limit.frequency
+        said = {"outcome": limit.outcome.value, "mechanism": limit.mechanism.value}
     found = {
-        "mu_crit": ((), limit.mu, {"long_name": "critical friction", "units": "1", **said}),
-        "frequency_crit": ((), limit.frequency, {"long_name": "frequency at the critical friction", "units": "Hz"}),
+        "mu_crit": ((), mu, {"long_name": "critical friction", "units": "1", **said}),
+        "frequency_crit": ((), frequency, {"long_name": "frequency at the critical friction", "units": "Hz"}),
     }
     if len(scene.structure.contacts) == 1:
         meeting = coalescence(scene.structure, direction=direction).mu

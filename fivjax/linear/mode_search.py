@@ -151,9 +151,11 @@ def complex_modes(
 def _residuals(pencil: Pencil, values, shapes) -> np.ndarray:
     found = []
     for value, shape in zip(values, shapes.T, strict=True):
-        terms = [value**2 * (pencil.mass @ shape), value * (pencil.damping @ shape), pencil.stiffness @ shape]
-        size = sum(np.linalg.norm(term) for term in terms)
-        found.append(np.linalg.norm(sum(terms)) / size if size else 0.0)
+        matrices = ((value**2, pencil.mass), (value, pencil.damping), (1.0, pencil.stiffness))
+        missed = np.linalg.norm(sum(power * (matrix @ shape) for power, matrix in matrices))
+        # Of a rigid-body motion each term is a difference of large numbers.
+        size = sum(abs(power) * np.linalg.norm(abs(matrix) @ np.abs(shape)) for power, matrix in matrices)
+        found.append(missed / size if size else 0.0)
     return np.array(found)
 
 

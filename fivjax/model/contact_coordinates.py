@@ -19,6 +19,16 @@ from .contact_point import ContactPoint, directions, pivots
 from .structure import FromParameters, Matrices, Structure
 
 
+def check_structure(structure) -> None:
+    """Refuse what is no structure, and several in one."""
+    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    if np.ndim(structure.mass) != 2:
+        raise ValueError(
+            f"This is not one structure but several, as `jax.vmap` returns them: its mass matrix has shape "
+            f"{np.shape(structure.mass)}. Take them one by one, by `jax.vmap` of the function that you called."
+        )
+
+
 def transformation(structure: Structure) -> tuple[np.ndarray, list[int]]:
     """X of q = X z, without unit, and the places in z of the tangential directions and then the normal ones."""
     n = structure.size
@@ -44,12 +54,7 @@ def in_contact_coordinates(structure: Structure) -> Structure:
         >>> fj.in_contact_coordinates(structure) is structure
         True
     """
-    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
-    if np.ndim(structure.mass) != 2:
-        raise ValueError(
-            f"This is not one structure but several, as `jax.vmap` returns them: its mass matrix has shape "
-            f"{np.shape(structure.mass)}. Take them one by one, by `jax.vmap` of the function that you called."
-        )
+    check_structure(structure)
     if structure.contacts_at_coordinates:
         return structure
     x, places = transformation(structure)
@@ -59,7 +64,10 @@ def in_contact_coordinates(structure: Structure) -> Structure:
     # Of the coordinates that the contacts' directions become.
     kinds = ("tangential", "normal")
     for place, name in zip(places, [kind + suffix for kind in kinds for suffix in suffixes], strict=True):
-        names[place] = name if name not in names else f"{name} of the contact"
+        # Nor may its velocity have the name of another coordinate.
+        while name in names or f"d{name}" in names:
+            name += " of the contact"
+        names[place] = name
     contacts = [ContactPoint(places[i], places[count + i]) for i in range(count)]
     source = structure.source
     if not isinstance(source, FromParameters):

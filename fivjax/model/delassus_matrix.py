@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..foundation import arguments
 from ..foundation.kept_programs import kept
 from ..foundation.linear_solve import solve
 from ..foundation.precision import returning_numpy
+from .contact_coordinates import check_structure
 from .structure import Structure
 
 
@@ -49,7 +49,7 @@ def delassus(structure: Structure) -> Delassus:
         >>> round(float(G.normal[0, 0] / abs(G.coupling[0, 0])), 2)  # Painlevé's limit
         108.49
     """
-    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    check_structure(structure)
     return _delassus(structure)
 
 

@@ -107,6 +107,10 @@ def craig_bampton(
                 f"The {name} matrix has negative eigenvalues ({count}), and a structure in contact must have none. Look at the "
                 f"signs and units in the {name} matrix; negative springs are not modelled."
             )
+    if not arguments.is_listed(keep):
+        raise TypeError(
+            f"Argument `keep` must be a list of coordinates, such as `[(7, 3)]`, but is {arguments.describe(keep)}."
+        )
     directions = np.hstack([structure.tangential_directions, structure.normal_directions])
     kept = np.any(directions != 0, axis=1)
     kept[[_index(structure, place) for place in keep]] = True
@@ -217,7 +221,7 @@ def _index(structure: SparseStructure, place) -> int:
         if not 0 <= place < structure.size:
             raise ValueError(f"Argument `keep` must hold indices below {structure.size}, but holds {place}.")
         return int(place)
-    if structure.labels is None or tuple(place) not in structure.labels:
+    if structure.labels is None or not arguments.is_listed(place) or tuple(place) not in structure.labels:
         raise ValueError(
             f"Argument `keep` must hold coordinates of the structure by node and direction, but holds {place!r}."
         )

@@ -229,10 +229,10 @@ def _each_number(name: str, value, count: int, **bounds) -> None:
     """Refuse anything but one number, or one for each contact."""
     if not is_known(value):
         return
-    if np.ndim(value) == 0 or count == 1:
+    array = arguments.numeric_array(name, value)
+    if array.ndim == 0 or count == 1:
         arguments.real_number(name, value, **bounds)
         return
-    array = arguments.numeric_array(name, value)
     if array.shape != (count,):
         raise ValueError(
             f"Argument `{name}` must be one number or hold one for each of the {count} contacts, but has shape {array.shape}."

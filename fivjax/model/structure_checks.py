@@ -237,7 +237,7 @@ def lowest_modes(stiffness, mass, count: int) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros((n, 0))
     # A shift keeps K + σM definite where rigid-body modes make K singular.
     small = 1e-3 * squares.min()
-    if n <= DENSE:
+    if n <= DENSE or count >= n:
         return _of_dense(stiffness.toarray(), mass.toarray(), small, count)
     start = np.random.default_rng(0).standard_normal(n)
     try:

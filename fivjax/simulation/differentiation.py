@@ -68,8 +68,12 @@ class Derivatives(eqx.Module):
         return self.by_name[name]
 
     def __repr__(self) -> str:
+        def one(value):
+            return f"{float(np.squeeze(value)):.8g}" if np.size(value) == 1 else f"array of shape {np.shape(value)}"
+
         def text(value):
-            return f"{float(value):.8g}" if np.size(value) == 1 else f"array of shape {np.shape(value)}"
+            each = list(map(one, jax.tree.leaves(value)))
+            return each[0] if len(each) == 1 else f"({', '.join(each)})"
 
         slopes = ", ".join(f"d/d {name} = {text(slope)}" for name, slope in self.by_name.items())
         return f"value {text(self.value)}; {slopes}; {self.events} contact events\n{self.reason}"

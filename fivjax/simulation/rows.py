@@ -237,7 +237,7 @@ def states_at(
     # Inside a scan common subexpressions are not merged across the checkpoint anyway.
     step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
     if derivatives is None:
-        start = StartOfRun(instants[0], physics.stuck(mechanics, contact0, y0), ledger0)
+        start = StartOfRun(instants[0], physics.stuck(mechanics, contact0, jnp.asarray(y0)), ledger0)
     else:
         start = start_of_run(scene, mechanics, contact0, y0, instants[0], ledger0, enter)
     _, after = jax.lax.scan(step, (start.t, start.y, contact0, start.total), ends)

@@ -267,7 +267,8 @@ def _saved_instants(method: AbstractStepper, t1: float, dt_save: float) -> tuple
             f"end on saved instants, so no step would be as long as `dt`. Save less often, or lower `dt`."
         )
     with np.errstate(over="ignore"):
-        rows, steps = float(np.float64(t1) / np.float64(dt_save)), float(np.float64(dt_save) / np.float64(method.dt))
+        rows = float(np.float64(t1) / np.float64(dt_save))
+        steps = float(np.float64(min(dt_save, t1)) / np.float64(method.dt))
     if rows > most_rows:
         raise ValueError(
             f"Argument `dt_save` asks for {rows:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "

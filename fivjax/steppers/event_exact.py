@@ -230,7 +230,7 @@ class EventExact(AbstractStepper):
         looser = 10
         after = self.order_ + 1
         tolerance = looser * attainable(self.tolerance, dtype)
-        return (tolerance * math.factorial(after)) ** (1.0 / after)
+        return math.exp((math.log(tolerance) + math.lgamma(after + 1)) / after)
 
     def _agreeing(
         self, mechanics: Mechanics, contact: Contact, series: "MotionSeries", reach

@@ -63,6 +63,25 @@ def test_settings_of_others_do_not_reach_in(paper_scene):
         assert fj.cea.eigenvalues(paper_scene.replace(k1=99e3)).shape == (4,)
 
 
+class Rounded(fj.AbstractFriction):
+    """A law that nothing has been traced of."""
+
+    mu: float
+
+    def __call__(self, slip_speed):
+        return self.mu + 0.0 * slip_speed
+
+
+def test_strict_promotion_of_types_is_not_asked_of_fivjax(paper_scene):
+    """It failed where code was traced, and not where that was kept from before."""
+    scene = fj.Scene(paper_scene.structure, Rounded(0.2), 1.0)
+    with jax.numpy_dtype_promotion("strict"):
+        assert fj.cea.growth_rate(scene) < 0
+        assert fj.simulate(scene, 0.01, 5e-3).meaning == "reached its end"
+        assert fj.simulate(scene, 0.01, 5e-3, fj.WhereSwitched(dt=1e-3)).meaning == "reached its end"
+        assert jax.config.jax_numpy_dtype_promotion == "strict"
+
+
 @pytest.mark.slow
 def test_transformations_around_simulate_without_double_precision(paper_scene):
     """Rejects `jit` that ends in an error of the compiler, and `grad` that fails without the sentence that has the remedy."""
