@@ -771,6 +771,10 @@ def test_what_friction_moves_ever_further_has_no_limit_of_steady_sliding():
     for limit_of in (fj.cea.critical_friction, fj.cea.stability_limit):
         with pytest.raises(ValueError, match="friction moves a part of the structure that no spring holds"):
             limit_of(with_a_free_mass(tangential=2))
+    # What else was asked for is there, without it.
+    modes = fj.cea.modes(with_a_free_mass(tangential=2), mu=[0.1, 0.2])
+    assert np.isnan(modes["mu_crit"]) and "no spring holds" in modes["mu_crit"].attrs["outcome"]
+    assert fj.cea.coalescence(belt(), damped=np.bool_(True)).mu == fj.cea.coalescence(belt(), damped=True).mu
 
 
 @pytest.mark.parametrize("damping", [2.0, 20.0])

@@ -7,6 +7,7 @@ from scipy import linalg, sparse
 import fivjax as fj
 from fivjax.linear import mode_search
 from fivjax.linear.mode_search import AT_ONCE, DENSE, near
+from fivjax.model import structure_checks
 from tests.helpers.brake import FOLDER, measure
 
 
@@ -337,8 +338,33 @@ REFUSED = {
         lambda big: fj.craig_bampton(big, 1e3, keep=[(99, 1)]),
         r"`keep` must hold coordinates",
     ),
+    "a coordinate that is none": (lambda big: fj.craig_bampton(big, 1e3, keep=[1.5]), r"`keep` must hold .* 1.5"),
     "no frequency": (lambda big: fj.craig_bampton(big, 0.0), r"`up_to` must be positive"),
 }
+
+
+def test_rigid_body_motions_satisfy_their_equation():
+    """Rounding was divided by itself: the only term that is left of it is a difference of large numbers."""
+    springs, damping = np.random.default_rng(0).uniform(1, 3, 5) * 1e5, 1e-5
+    stiffness = sum(k * np.outer(ends, ends) for k, ends in zip(springs, np.eye(6)[:-1] - np.eye(6)[1:], strict=True))
+    modes = fj.cea.complex_modes(fj.cea.Pencil(np.diag(np.linspace(0.5, 2.0, 6)), damping * stiffness, stiffness))
+    assert np.sum(modes.eigenvalues == 0) == 2
+    assert np.max(modes.residuals) < 1e-14
+
+
+def test_all_frequencies_of_a_large_structure_are_there():
+    """An iteration for some of them finds one less than there are."""
+    n = structure_checks.DENSE + 20
+    stiffness = sparse.diags_array([np.full(n, 2e4), *2 * [np.full(n - 1, -1e4)]], offsets=(0, 1, -1)).tocsr()
+    squares, modes = structure_checks.lowest_modes(stiffness, sparse.eye_array(n).tocsr(), n)
+    np.testing.assert_allclose(squares, 4e4 * np.sin(np.pi * np.arange(1, n + 1) / (2 * n + 2)) ** 2, rtol=1e-9)
+    assert modes.shape == (n, n)
+
+
+@pytest.mark.parametrize("keep", [3, None, 2.0])
+def test_what_is_kept_is_a_list(keep, big):
+    with pytest.raises(TypeError, match=r"`keep` must be a list of coordinates"):
+        fj.craig_bampton(big, 1e3, keep=keep)
 
 
 @pytest.mark.parametrize("case", REFUSED)

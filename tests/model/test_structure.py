@@ -473,6 +473,17 @@ def test_coordinates_have_names():
             fj.Structure(**GOOD, coordinates=names)
 
 
+@pytest.mark.parametrize(
+    "names", [("a", "dnormal", "b"), ("a", "b", "dtangential"), ("normal", "b", "normal of the contact")]
+)
+def test_contact_coordinates_have_names_that_are_free(names):
+    """Also those of their velocities: a structure that was taken could not be simulated."""
+    point = fj.ContactPoint([0.2, 1.0, 0.0], [0.0, 0.3, 1.0])
+    structure = fj.Structure(np.eye(3), np.zeros((3, 3)), np.eye(3), [0, 0, -1.0], contacts=[point], coordinates=names)
+    found = fj.in_contact_coordinates(structure).coordinates
+    assert len({*found, *(f"d{name}" for name in found)}) == 6
+
+
 @pytest.mark.parametrize("fixed", [2.0, np.full((2, 2), 2.0)], ids=["a number", "an array"])
 def test_a_builder_may_make_the_function_of_the_matrices_anew(fixed):
     """A branch over a parameter of such a structure ended in an error of JAX's, and each value had kernels of its own."""

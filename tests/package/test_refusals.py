@@ -358,6 +358,19 @@ def test_what_is_no_structure_or_scene(given):
         fj.sliding_equilibrium(given)
 
 
+@pytest.mark.parametrize("function", STRUCTURES)
+def test_several_structures_in_one(function):
+    with jax.enable_x64(True):
+        several = jax.vmap(lambda k1: fj.belt_oscillator(k1=k1))(np.array([1e5, 2e5]))
+    with refused(ValueError, "not one structure but several", "jax.vmap"):
+        function(several)
+
+
+def test_belt_speeds_that_are_no_array():
+    with refused(TypeError, "`belt_speed` must be numeric"):
+        fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), [[1.0], [1.0, 2.0]])
+
+
 @pytest.mark.parametrize("given", [1.0, "a", [1, 2], {}, True])
 def test_what_is_no_cycle(paper_scene, given):
     with refused(TypeError, "`cycle`", "limit_cycle(scene)"):

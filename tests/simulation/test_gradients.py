@@ -3,6 +3,9 @@
 The whole table, reverse mode included, is printed by `python -m benchmarks.gradients`.
 """
 
+import math
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -304,6 +307,27 @@ def test_refusals(options, error, fragments):
         fj.derivatives(**given)
     for fragment in fragments:
         assert fragment in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("functional", "said"),
+    [
+        (lambda run: (run.velocity[-1, 0],), r"value -?\d.*; d/d mu = -?\d"),
+        (lambda run: {"a": run.velocity[-1, 0], "b": run.t}, r"value \(-?\d.*, array of shape \(.*\)\); d/d mu = \("),
+    ],
+)
+def test_derivatives_of_several_numbers_are_printed(functional, said):
+    assert re.match(said, repr(fj.derivatives(functional, cases.paper(), ["mu"], 1e-3)))
+
+
+def test_an_order_beyond_the_factorials_has_steps():
+    """The factorial of 171 is no number of double precision; an error of the series is as far away as Stirling has it."""
+    angles = [fj.EventExact(order=order)._angle(np.float64) for order in (20, 100, 168, 200)]
+    tolerance = (angles[0] ** 21) / math.factorial(21)
+    for order, angle in zip((100, 168), angles[1:], strict=False):
+        assert angle == pytest.approx((tolerance * math.factorial(order + 1)) ** (1 / (order + 1)), rel=1e-10)
+    stirling = 201 / math.e * (tolerance * math.sqrt(2 * math.pi * 201)) ** (1 / 201)
+    assert angles[-1] == pytest.approx(stirling, rel=1e-5)
 
 
 @pytest.mark.slow

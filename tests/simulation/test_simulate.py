@@ -448,3 +448,5 @@ def test_steps_of_no_length_are_refused(paper_scene):
     """They would take weeks."""
     with pytest.raises(ValueError, match=r"has steps of 1e-14 s, of which 1e\+10 lie between two saved rows"):
         fj.simulate(paper_scene, 1.0, method=fj.EventExact(dt=1e-14))
+    # Not where there are few, because the run ends long before the next saved row.
+    assert len(fj.simulate(paper_scene, 1e-3, 1e9, fj.EventExact(dt=1e-4)).t) == 2
