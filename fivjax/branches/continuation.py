@@ -7,6 +7,7 @@ continues along the curve for the sequence of modes that the real motion has bey
 """
 
 import contextlib
+import warnings
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -94,7 +95,8 @@ def continue_cycle(
 
     The attributes `begins` and `ends` say in a sentence where each end is, and why. A closed curve is passed once. A branch of
     cycles whose two halves become alike ends there, at the period doubling from which it comes. Where cycles cannot be followed
-    it goes on with the next one much like the last, if there is one; others that coexist there are not looked for.
+    it goes on with the next one much like the last, if there is one; others that coexist there are not looked for. Interrupted
+    by the user, it returns the cycles known by then, without `d_special`, and the attribute `interrupted` is 1.
 
     **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not contain the scene's value or that it
     cannot have, and for anything that `limit_cycle` refuses; `NoLimitCycle` if there is no periodic cycle to start from.
@@ -143,15 +145,19 @@ def continue_cycle(
         )
     down = follow_branch(family, first, -1.0, points)
     # A closed curve is whole by one half; its first cycle is its last as well. The other may have ended on the way.
-    up = HalfBranch([], down.ending) if down.closed else follow_branch(family, first, 1.0, points)
+    whole = down.closed or down.interrupted
+    up = HalfBranch([], down.ending) if whole else follow_branch(family, first, 1.0, points)
     if up.closed:
         down = HalfBranch([], up.ending)
     along = [*reversed(down.points), first, *up.points]
-    if derivatives:
+    interrupted, slopes = down.interrupted or up.interrupted, None
+    if interrupted:
+        warnings.warn(f"Interrupted: the branch has the {len(along)} cycles that were computed by then.", stacklevel=2)
+    elif derivatives:
         stage("differentiating special points")
-    slopes = derivatives_of_special_points(family, along) if derivatives else None
+        slopes = derivatives_of_special_points(family, along)
     return labelled(_dataset(family, along, slopes), final, parameter=parameter).assign_attrs(
-        parameter=parameter, begins=down.ending, ends=up.ending
+        parameter=parameter, begins=down.ending, ends=up.ending, interrupted=int(interrupted)
     )
 
 

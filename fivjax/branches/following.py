@@ -26,6 +26,7 @@ class HalfBranch(NamedTuple):
     points: list[BranchPoint]
     ending: str  # why it ends, a sentence
     closed: bool = False  # whether it has come back to where it began
+    interrupted: bool = False
 
 
 def follow_branch(family: Family, start: BranchPoint, sense: float, most: int) -> HalfBranch:
@@ -33,7 +34,11 @@ def follow_branch(family: Family, start: BranchPoint, sense: float, most: int) -
     front = _Front(family, start, sense)
     while len(front.points) < most:
         stage(f"following, {len(front.points)} cycles so far")
-        if (ended := front.advance()) is not None:
+        try:
+            ended = front.advance()
+        except KeyboardInterrupt:
+            return front.ended(front.here, "it was interrupted")._replace(interrupted=True)
+        if ended is not None:
             return ended
     return front.ended(front.here, f"`points` = {most} points are computed")
 

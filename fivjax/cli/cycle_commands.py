@@ -1,6 +1,7 @@
 """`fivjax cycle` and `fivjax branch`: the limit cycle of a scene with its saddle, and its bifurcation diagram."""
 
 import dataclasses
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,7 @@ import tyro
 import fivjax as fj
 
 from ..foundation.digits import apart
-from .outputs import Failure, Overwrite, output_paths, write_data, write_picture
+from .outputs import Failure, Interrupted, Overwrite, output_paths, write_data, write_picture
 from .parsing import axis, bound
 from .structure_options import StructureOptions
 
@@ -91,10 +92,17 @@ class Branch:
         scenes = [scene if other is None else scene.replace(**{other: value}) for value in values]
         for here, label, path in zip(scenes, labels, data, strict=False):
             try:
-                branches[label] = fj.continue_cycle(here, name, bounds, points=self.points)
+                with warnings.catch_warnings():
+                    # The message printed below says more.
+                    warnings.filterwarnings("ignore", message="Interrupted:")
+                    branches[label] = fj.continue_cycle(here, name, bounds, points=self.points)
             except fj.NoLimitCycle as none:
                 raise Failure(f"{label + ': ' if label else ''}{none}") from none
             write_data(branches[label], path)
+            if branches[label].attrs.get("interrupted"):
+                raise Interrupted(
+                    f"Interrupted; `{path}` has the {branches[label].sizes['point']} cycles known by then."
+                )
         beside = None
         if upwards is not None:
             low = max(bounds[0], 1e-9) if name == "mu" else bounds[0]

@@ -14,7 +14,7 @@ Overwrite = Annotated[bool, tyro.conf.arg(help="replace files that are there alr
 
 
 class Interrupted(Exception):
-    """A run was stopped from outside and can be resumed."""
+    """A run was stopped from outside: a sentence about what is kept of it."""
 
 
 class Failure(Exception):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.branches import pseudo_arclength, verification
+from fivjax.branches import following, pseudo_arclength, verification
 from fivjax.branches.special_points import pairing
 from fivjax.model import own_structures
 from tests.helpers import oracle, reference
@@ -519,6 +519,29 @@ def test_long_cycles_have_the_tangents_and_corrections_of_short_ones():
     # Where another solution is left, there still is a vector that the equations leave.
     rows[0] = rows[1]
     np.testing.assert_allclose(rows @ pseudo_arclength._null_vector(rows, None), 0, atol=1e-10)
+
+
+@pytest.mark.parametrize("after", [3, 12])
+def test_an_interrupted_branch_has_what_was_computed(monkeypatch, after):
+    """In the first direction or in the second: the part of the whole branch."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.ConstantLoad(100.0))
+    whole, steps = fj.continue_cycle(scene, "mu", (0.2, 0.25), points=6), []
+    advance = following._Front.advance
+
+    def interrupted(front):
+        steps.append(front)
+        if len(steps) == after:
+            raise KeyboardInterrupt
+        return advance(front)
+
+    monkeypatch.setattr(following._Front, "advance", interrupted)
+    with pytest.warns(UserWarning, match="Interrupted: the branch has the"):
+        part = fj.continue_cycle(scene, "mu", (0.2, 0.25), points=6, derivatives=True)
+    assert part.attrs["interrupted"] == 1 and whole.attrs["interrupted"] == 0
+    assert len(steps) == after and "it was interrupted" in part.attrs["ends"]
+    assert 3 <= part.sizes["point"] < whole.sizes["point"] and "d_special" not in part
+    places = np.searchsorted(whole["parameter"].values, part["parameter"].values)
+    np.testing.assert_array_equal(whole.isel(point=places)["amplitude"], part["amplitude"])
 
 
 def test_a_change_of_modes_lies_between_its_neighbours():

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -165,6 +166,17 @@ def test_cea_of_falling_friction_says_whether_this_scene_slides(tmp_path, capsys
         f"growth rate of this scene {growth:.6g} 1/s, so steady sliding is unstable; if friction were constant:" in said
     )
     assert said.index("if friction were constant") < said.index("critical friction")
+
+
+def test_an_interrupted_branch_is_written(monkeypatch, tmp_path, capsys):
+    def followed(*_, **__):
+        warnings.warn("Interrupted: so it is.", stacklevel=2)
+        return xr.Dataset({"amplitude": ("point", np.ones(2))}, attrs={"interrupted": 1})
+
+    monkeypatch.setattr(fj, "continue_cycle", followed)
+    assert main(["branch", "--over", "mu=0.2:0.25", "--mu", "0.227", "--out", str(tmp_path / "b")]) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["b.nc"]
+    assert capsys.readouterr().err.endswith(f"Interrupted; `{tmp_path / 'b.nc'}` has the 2 cycles known by then.\n")
 
 
 def test_a_branch_that_cannot_begin_costs_none_that_is_done(monkeypatch, tmp_path, capsys):
