@@ -11,8 +11,7 @@ from ..foundation.kept_programs import kept
 from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, real
 from ..io.datasets import check_axis_names, labelled
-from ..model.scene import Scene, sliding_friction
-from ..model.sliding import sliding_coordinates, sliding_rows
+from ..model.scene import Scene, steady_sliding
 from ..model.structure import Structure
 from .linearisation import sliding_motion, steady_matrices, time_scale
 from .polynomials import characteristic_polynomial, determinant, polynomial_roots
@@ -89,7 +88,7 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
 def _chart(scene, names, columns):
     def polynomial(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))
-        normal_force = _normal_force(point)
+        _, normal_force = steady_sliding(point, point.load.final)
         mass, damping, stiffness = steady_matrices(point, normal_force)
         scale = time_scale(point.structure)
         coefficients = characteristic_polynomial(mass, damping, stiffness, scale)
@@ -124,19 +123,6 @@ def _chart(scene, names, columns):
 def _is_expanded(structure: Structure) -> bool:
     """Whether the characteristic polynomial is written out."""
     return len(structure.contacts) == 1 and structure.size - 1 <= LARGEST_EXPANDED
-
-
-def _normal_force(scene: Scene):
-    """That of steady sliding in N, by sums and products only, for few coordinates."""
-    structure = scene.structure
-    n, keep = structure.normal, sliding_coordinates(structure.size, structure.normal)
-    # The sliding rows of [K, f], bordered by the normal row: by Cramer's rule N/F = -det[[K, f], [k_n, f_n]] / det K.
-    table = jnp.concatenate([structure.stiffness, structure.load_direction[:, None]], axis=1)
-    rows = sliding_rows(structure, table, sliding_friction(scene))
-    columns = [*keep, structure.size]
-    stiffness = determinant([[[row[j]] for j in keep] for row in rows])[0][0]
-    bordered = determinant([[[row[j]] for j in columns] for row in [*rows, table[n]]])[0][0]
-    return -bordered / stiffness * scene.load.final
 
 
 def _slides(scene: Scene, normal_forces):
