@@ -18,7 +18,7 @@ HALVINGS = 5
 CLOSED = 1e-10
 # A cycle that was closed over several of its periods returns so nearly after one, where it is hardly stable.
 NEARLY = 1e-7
-# Where displacements are so many times as large as velocities, in energy, it is looked whether these return, too.
+# Where displacements are so many times as large as velocities, in the norm of energy, it is looked whether these return, too.
 FAR = 1e6
 # Newton's method stops when the distance no longer falls, or is below this.
 EXACT = 2e-15

@@ -190,14 +190,14 @@ class LimitCycle(eqx.Module):
     @property
     def energy(self) -> dict[str, float]:
         """Energy per period by line of the ledger, in J: work of the contact, the dampers and the load, and the loss in
-        impacts.
+        impacts. Of a torus, where no return is like another, the mean over 256 of them.
         """
-        # An impact may lead to the section, so that a period is taken which neither begins nor ends there.
-        points, begin = 64, 23
-        ledger = self.trajectory(2 * points, periods=2, energy=True).energy
+        # An impact may lead to the section, so that periods are taken which neither begin nor end there.
+        points, begin, count = 64, 23, 1 if self.kind == "periodic" else 256
+        ledger = self.trajectory((count + 1) * points, periods=count + 1, energy=True).energy
         assert ledger is not None
         lines = {**ledger.work.lines("work"), "impact_loss": ledger.impact}
-        return {name: float(line[begin + points] - line[begin]) for name, line in lines.items()}
+        return {name: float(line[begin + count * points] - line[begin]) / count for name, line in lines.items()}
 
     def __str__(self) -> str:
         # So many phases of the word are printed.

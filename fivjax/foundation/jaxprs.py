@@ -15,6 +15,9 @@ _known_dependence: weakref.WeakKeyDictionary[Jaxpr, dict[tuple[bool, ...], list[
 
 def within(params) -> ClosedJaxpr | None:
     """The traced function that an equation calls once, if it calls one."""
+    # That of a reduction is for two numbers.
+    if "dimensions" in params or "window_dimensions" in params:
+        return None
     for name in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call"):
         part = params.get(name)
         # Newer versions have one class for both.

@@ -17,12 +17,13 @@ from ..foundation.plain_trees import from_text, structure_to_text
 from ..foundation.precision import own_settings
 from . import cpp_elimination, cpp_loops, cpp_places, cpp_reductions
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural
-from .cpp_lanes import OF_LANES, REALS
+from .cpp_lanes import ADDING, OF_LANES, REALS
 from .cpp_numbers import WIDE, converted, kind_of
 from .cpp_writer import Writer
 
 # Everything that is known of primitives, together.
 RULES = cpp_places.RULES | cpp_reductions.RULES | cpp_loops.RULES
+RULES |= {name: cpp_reductions.within_bits(RULES[name]) for name in ADDING}
 
 
 class Slot(NamedTuple):

@@ -16,9 +16,11 @@ OF_LANES = {
     "long long": WHOLES,
 }
 KINDS = (REALS, TRUTHS, WHOLES)
-# By how many bits whole numbers of lanes are longer than one lane's; and what may go beyond that one's.
+# By how many bits whole numbers of lanes are longer than one lane's; what may go beyond that one's number by number, and what
+# does so by many numbers.
 LONGER = {"int": 32, "signed char": 56}
 GOING_BEYOND = ("add", "add_any", "sub", "mul", "neg", "square", "integer_pow")
+ADDING = ("reduce_sum", "reduce_prod", "dot_general", "scatter-add")
 # The primitives that are written in another way than for one lane.
 BY_NUMBER = {
     "sign": "sign({})",
@@ -113,10 +115,9 @@ def declarations(lanes: int) -> str:
         # Numbers at places of arrays that differ from lane to lane.
         "template <class T> static inline T picked(const T* all, const wholes at) {",
         "  T found; for (int l = 0; l < LANES; ++l) found[l] = all[at[l]][l]; return found; }",
-        "static inline reals picked(const double* all, const wholes at) {",
-        "  reals found; for (int l = 0; l < LANES; ++l) found[l] = all[at[l]]; return found; }",
-        "static inline wholes picked(const int* all, const wholes at) {",
-        "  wholes found; for (int l = 0; l < LANES; ++l) found[l] = all[at[l]]; return found; }",
+        _picked("double", REALS, "all[at[l]]"),
+        *(_picked(kind, WHOLES, "all[at[l]]") for kind in ("int", "signed char", "long long")),
+        _picked("bool", TRUTHS, "-(long long)all[at[l]]"),
         "template <class T> static inline void put(T* all, const wholes at, const T own) {",
         "  for (int l = 0; l < LANES; ++l) all[at[l]][l] = own[l]; }",
         "template <class T> static inline void add(T* all, const wholes at, const T own) {",
@@ -136,6 +137,11 @@ def _of_numbers(name: str, numbers: tuple[str, ...], own: str) -> str:
     told, each = (", ".join(form.format(one) for one in numbers) for form in ("const reals {}", "{}[l]"))
     head = f"namespace wp {{ static inline reals {name}({told})"
     return f"{head} {{ reals found; for (int l = 0; l < LANES; ++l) found[l] = {own}({each}); return found; }} }}"
+
+
+def _picked(kind: str, of_lanes: str, own: str) -> str:
+    head = f"static inline {of_lanes} picked(const {kind}* all, const wholes at)"
+    return f"{head} {{ {of_lanes} found; for (int l = 0; l < LANES; ++l) found[l] = {own}; return found; }}"
 
 
 def _of_vectors(name: str, own: str) -> str:

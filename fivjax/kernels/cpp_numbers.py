@@ -103,8 +103,8 @@ COMPARISONS = ("lt", "le", "lt_to", "le_to", "gt", "ge", "eq", "ne", "is_finite"
 def kind_of(aval, of_lanes: bool = False) -> str:
     """The type in C++ of numbers of an array.
 
-    **Raises:** `NotImplementedError` where there is none, as of numbers in single precision; of lanes side by side, which
-    compare, divide and carry over numbers as those with a sign, none without.
+    **Raises:** `NotImplementedError` where there is none, as of numbers in single precision; side by side also for numbers
+    without a sign, because vectors compare, divide and carry over as numbers with one.
     """
     if aval.dtype == jax.dtypes.float0:
         return "bool"
@@ -149,6 +149,9 @@ def _form_for(name: str, form: str, kind: str) -> str:
         return f"({{0}} < ({kind})(0) ? -{{0}} : {{0}})"
     if name in ("max", "min") and kind == cpp_lanes.REALS:
         return cpp_lanes.BY_NUMBER[name]
+    if name in ("max", "min") and kind == cpp_lanes.TRUTHS:
+        # What holds is less than zero, as a number.
+        return BY_NUMBER["or" if name == "max" else "and"]
     return form.replace(" ?", " || {0} != {0} ?") if name in ("max", "min") and kind == "double" else form
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from . import cpp_lanes
 from .cpp_arrays import Value, View, has_known_numbers
 from .cpp_lanes import KINDS, TRUTHS
 from .cpp_numbers import BY_NUMBER, converted, form_for
@@ -64,6 +65,18 @@ def _written_in_loops(writer: Writer, name: str, value: View, axes) -> View:
     writer.put(f"{into.at(outer)} = {total};")
     writer.close(len(outer))
     return into
+
+
+def within_bits(rule: Callable) -> Callable:
+    """A rule whose sums of lanes side by side begin again at the other end where one lane's numbers do."""
+
+    def of(writer: Writer, equation, operands, kind: str) -> Value:
+        found = rule(writer, equation, operands, kind)
+        if not (writer.lanes and kind in cpp_lanes.LONGER and writer.is_wide(found)):
+            return found
+        return writer.each("", cpp_lanes.within_bits("{}", kind), [found], kind)
+
+    return of
 
 
 def _running(name: str) -> Callable:

@@ -30,6 +30,10 @@ from .several_contacts import critical_friction_of_several, first_limit_of_sever
 from .system import as_scene, checked_direction
 
 
+class NoSteadySliding(ValueError):
+    """Friction moves a part of the structure that no spring holds."""
+
+
 class StabilityLimit(eqx.Module):
     """The friction at which steady sliding becomes unstable, and how.
 
@@ -89,7 +93,7 @@ def _checked(structure: Structure, direction) -> Structure:
         motions = units[:, None] * motions
         moved = np.abs(motions[np.isin(free, tangential)]).max(axis=0)
         if np.any((held < 1e-12) & (moved > 1e-9 * np.abs(motions).max(axis=0))):
-            raise ValueError(
+            raise NoSteadySliding(
                 "There is no steady sliding: friction moves a part of the structure that no spring holds. "
                 "Hold it by a spring along the belt."
             )

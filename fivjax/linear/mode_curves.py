@@ -11,9 +11,10 @@ from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import Scene
 from ..model.sliding import free_in_sliding
 from ..model.structure import Structure
-from .critical import stability_limit
+from .critical import NoSteadySliding, stability_limit
 from .mode_coupling import coalescence
 from .mode_following import HALVINGS, LOOKS, Sampler, match_modes
+from .outcomes import Mechanism
 from .system import with_axes
 
 if TYPE_CHECKING:
@@ -85,8 +86,8 @@ def modes(system: Structure | Scene, *, direction: int = 1, progress: bool | Non
 def _limits(scene: Scene, direction: int) -> dict:
     try:
         limit = stability_limit(scene.structure, direction=direction)
-    except ValueError as error:  # at some friction nothing slides steadily
-        mu, frequency, said = np.nan, np.nan, {"outcome": str(error)}
+    except NoSteadySliding as error:
+        mu, frequency, said = np.nan, np.nan, {"outcome": str(error), "mechanism": Mechanism.NONE.value}
     else:
         mu, frequency = limit.mu, limit.frequency
         said = {"outcome": limit.outcome.value, "mechanism": limit.mechanism.value}

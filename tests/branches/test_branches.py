@@ -544,13 +544,23 @@ def test_an_interrupted_branch_has_what_was_computed(monkeypatch, after):
     np.testing.assert_array_equal(whole.isel(point=places)["amplitude"], part["amplitude"])
 
 
-def test_a_change_of_modes_lies_between_its_neighbours():
+def test_a_change_of_modes_lies_between_its_neighbours(monkeypatch):
     """Not where another guard grazes nearby: from 0.1592 on the impulse of the landing slips, at 0.1543 its force began to stick.
     An independent solver's impulses reach the cone at 0.1592076.
     """
     scene = fj.Scene(fj.belt_oscillator(theta=0.15050915266402265), fj.Coulomb(0.227), 1.0, fj.ConstantLoad(100.0))
     state = [-2.19633482e-03, 7.66877325e-04, 1.28055211e-03, 0.0, -5.87443988e-02, -7.85433868e-01]
-    branch = fj.continue_cycle(scene, "theta", (0.1, 0.4), fj.limit_cycle(scene, state), points=8)
+    cycle, segments, follow = fj.limit_cycle(scene, state), [], verification.follow_period
+
+    def counted(*args):
+        found = follow(*args)
+        segments.append(len(found.segments.h))
+        return found
+
+    monkeypatch.setattr(verification, "follow_period", counted)
+    branch = fj.continue_cycle(scene, "theta", (0.1, 0.4), cycle, points=8)
+    # Where one touches another mode at once again, 262,136 were followed, which took minutes.
+    assert max(segments) == 64
     theta, special = branch["parameter"].values, branch["special"].values
     places = np.flatnonzero(special)
     assert list(special[places])[-2:] == ["edge of the friction cone: slip removed", "slip inserted"]

@@ -453,8 +453,27 @@ def of_large_numbers(args, instants):
         "beyond 53 bits": jnp.abs(x - 2**53) - 2**53,
         "of equal ones": [(x - x) & y, jax.lax.rem(x - x, y)],
         "of 8 bits": [*few, few[0] + few[1], few[0] * few[1], -few[0], args[0].astype(jnp.int8)],
+        "of many": [
+            jnp.sum(jnp.outer(few[0], jnp.ones(60, jnp.int8)), dtype=jnp.int8),
+            jnp.sum((x * jnp.arange(1, 90)).astype(jnp.int32) * 40_000_003, dtype=jnp.int32),
+            jnp.prod((y + jnp.arange(50)).astype(jnp.int32), dtype=jnp.int32),
+            jnp.full((8, 8), 90_000_001, jnp.int32) @ (x + jnp.arange(8)).astype(jnp.int32),
+            jnp.zeros(3, jnp.int32).at[y % 3].add(2_000_000_000).at[y % 3].add(2_000_000_000),
+        ],
+        "true": [jnp.maximum(x > 0, y > 0), jnp.minimum(x > 0, y > 0), jnp.max(jnp.stack([x > 0, y > 0]))],
+        "from tables": [jnp.asarray(np.arange(60) % 7 > 2, kind)[y % 50] for kind in (jnp.int8, jnp.int64, bool)],
         "of 32 bits": [(x * most).astype(jnp.int32), x.astype(jnp.int32) * 1_000_003 + y.astype(jnp.int32) * 10**9],
     }, ()
+
+
+def test_a_general_reduction_is_left_to_xla():
+    """It holds a function of two numbers, which was called for all of them at once: what it wrote had no room."""
+
+    def summed(args, instants):
+        return [jax.lax.reduce(args[0] * jnp.arange(3.0), args[0], jax.lax.add, (0,))], ()
+
+    with pytest.raises(NotImplementedError, match="`reduce` has no C"):
+        KernelFunction(summed)((np.float64(2.0),), np.zeros(1))
 
 
 def without_sign(args, instants):

@@ -774,6 +774,7 @@ def test_what_friction_moves_ever_further_has_no_limit_of_steady_sliding():
     # What else was asked for is there, without it.
     modes = fj.cea.modes(with_a_free_mass(tangential=2), mu=[0.1, 0.2])
     assert np.isnan(modes["mu_crit"]) and "no spring holds" in modes["mu_crit"].attrs["outcome"]
+    assert modes["mu_crit"].attrs["mechanism"] == "none"
     assert fj.cea.coalescence(belt(), damped=np.bool_(True)).mu == fj.cea.coalescence(belt(), damped=True).mu
 
 
