@@ -9,6 +9,7 @@ from jaxtyping import Complex, Float
 
 from ..attractors.closing import FixedPoint
 from ..attractors.cycles import FAMILY_TOLERANCE
+from ..attractors.motions import smooth_mean
 from ..contact import Contact, Status
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
@@ -197,7 +198,7 @@ class LimitCycle(eqx.Module):
         ledger = self.trajectory((count + 1) * points, periods=count + 1, energy=True).energy
         assert ledger is not None
         lines = {**ledger.work.lines("work"), "impact_loss": ledger.impact}
-        return {name: float(line[begin + count * points] - line[begin]) / count for name, line in lines.items()}
+        return {name: float(smooth_mean(np.diff(line[begin::points]))) for name, line in lines.items()}
 
     def __str__(self) -> str:
         # So many phases of the word are printed.
