@@ -231,10 +231,8 @@ class Ends(NamedTuple):
 
 
 def _contacts(modes: Sequence[Mode]) -> Contact:
-    status, direction = (
-        np.array([mode.status for mode in modes], np.int32),
-        np.array([mode.direction for mode in modes]),
-    )
+    status = np.array([mode.status for mode in modes], np.int32)
+    direction = np.array([mode.direction for mode in modes])
     each = np.s_[:, 0] if status.shape[1] == 1 else np.s_[:]
     return Contact(status[each], np.where(direction == 0, 1.0, direction)[each])
 

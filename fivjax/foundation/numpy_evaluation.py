@@ -1,6 +1,6 @@
 """A traced function computed by NumPy, equation by equation: for small functions of known values.
 
-XLA takes longer to compile such a function than NumPy takes for some hundred calls. Which equations there are is kept for later
+XLA takes longer to compile such a function than NumPy takes for hundreds of calls. Which equations there are is kept for later
 processes (`numpy_plans`), because to trace the function takes longer still than to compute it.
 """
 

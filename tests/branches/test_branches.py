@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.branches import following, pseudo_arclength, verification
+from fivjax.branches import following, pseudo_arclength, special_derivatives, verification
+from fivjax.branches.multiple_shooting import Mode
 from fivjax.branches.special_points import pairing
 from fivjax.model import own_structures
 from tests.helpers import oracle, reference
@@ -519,6 +520,16 @@ def test_long_cycles_have_the_tangents_and_corrections_of_short_ones():
     # Where another solution is left, there still is a vector that the equations leave.
     rows[0] = rows[1]
     np.testing.assert_allclose(rows @ pseudo_arclength._null_vector(rows, None), 0, atol=1e-10)
+
+
+@pytest.mark.parametrize(("ending", "withheld"), [(0, True), (2, False)])
+def test_a_flight_that_another_s_landing_begins_grows_from_nothing(ending, withheld):
+    """By a little restitution that contact rebounds as well. The end of sliding at the other begins no rebounds."""
+    modes = Mode((2, 1), (0.0, 1.0), ending), Mode((1, 2), (1.0, 0.0), 2)
+    grazing = SimpleNamespace(minimum=SimpleNamespace(phase=1, guard=2, time=0.0))
+    cycle = SimpleNamespace(phases=SimpleNamespace(modes=modes))
+    special = SimpleNamespace(cycle=cycle, turns=False, multiplier=None, grazing=grazing)
+    assert special_derivatives._rebounds_change(special) == withheld  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("after", [3, 12])
