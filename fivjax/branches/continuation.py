@@ -145,8 +145,8 @@ def continue_cycle(
         )
     down = follow_branch(family, first, -1.0, points)
     # A closed curve is whole by one half; its first cycle is its last as well. The other may have ended on the way.
-    whole = down.closed or down.interrupted
-    up = HalfBranch([], down.ending) if whole else follow_branch(family, first, 1.0, points)
+    no_more = down.closed or down.interrupted
+    up = HalfBranch([], down.ending) if no_more else follow_branch(family, first, 1.0, points)
     if up.closed:
         down = HalfBranch([], up.ending)
     along = [*reversed(down.points), first, *up.points]

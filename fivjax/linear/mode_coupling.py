@@ -84,9 +84,8 @@ def coalescence(structure: Structure, *, damped: bool = False, direction: int = 
         >>> round(float(fj.cea.coalescence(structure).mu), 5)
         0.22636
     """
-    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
-    arguments.known("structure", structure)
     structure = in_contact_coordinates(structure)
+    arguments.known("structure", structure)
     refuse_several_contacts(structure, "`coalescence`", "`growth_rate` takes several.")
     arguments.truth("damped", damped)
     damped = bool(damped)

@@ -148,22 +148,28 @@ def complex_modes(
     return ComplexModes(values, shapes / largest, residuals, rounding, strip, pencil)
 
 
+def _terms(pencil: Pencil, s):
+    """The powers of `s` in the pencil, each with its matrix."""
+    return (s**2, pencil.mass), (s, pencil.damping), (1.0, pencil.stiffness)
+
+
 def _residuals(pencil: Pencil, values, shapes) -> np.ndarray:
     found = []
     for value, shape in zip(values, shapes.T, strict=True):
-        matrices = ((value**2, pencil.mass), (value, pencil.damping), (1.0, pencil.stiffness))
-        missed = np.linalg.norm(sum(power * (matrix @ shape) for power, matrix in matrices))
+        terms = _terms(pencil, value)
+        missed = np.linalg.norm(sum(power * (matrix @ shape) for power, matrix in terms))
         # Of a rigid-body motion each term is a difference of large numbers.
-        size = sum(abs(power) * np.linalg.norm(abs(matrix) @ np.abs(shape)) for power, matrix in matrices)
+        size = sum(abs(power) * np.linalg.norm(abs(matrix) @ np.abs(shape)) for power, matrix in terms)
         found.append(missed / size if size else 0.0)
     return np.array(found)
 
 
 def _rounding(pencil: Pencil, values, shapes) -> np.ndarray:
     """About how far each eigenvalue moves when every entry of the matrices changes by some rounding errors."""
-    sizes, powers = np.abs(shapes), np.abs(values)
-    matrices = ((powers**2, pencil.mass), (powers, pencil.damping), (1.0, pencil.stiffness))
-    terms = sum(power * np.sum(sizes * (abs(matrix) @ sizes), axis=0) for power, matrix in matrices)
+    sizes = np.abs(shapes)
+    terms = sum(
+        power * np.sum(sizes * (abs(matrix) @ sizes), axis=0) for power, matrix in _terms(pencil, np.abs(values))
+    )
     moved = pencil.mass @ shapes
     slope = np.sum(sizes * np.abs(2 * values * moved + pencil.damping @ shapes), axis=0)
     bend = np.sum(sizes * np.abs(moved), axis=0)

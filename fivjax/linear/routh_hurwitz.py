@@ -69,7 +69,6 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
         >>> bool(fj.cea.margin(structure, 0.2) > 0), bool(fj.cea.margin(structure, 0.3) > 0)
         (True, False)
     """
-    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     structure = in_contact_coordinates(structure)
     refuse_several_contacts(structure, "`margin`", "`growth_rate` takes several.")
     arguments.real_number("mu", mu, minimum=0)

@@ -342,7 +342,6 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
         >>> round(float(fj.painleve_friction(structure)), 2)
         108.49
     """
-    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     return _painleve_friction(in_contact_coordinates(structure))
 
 
