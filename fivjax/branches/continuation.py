@@ -151,11 +151,14 @@ def continue_cycle(
         down = HalfBranch([], up.ending)
     along = [*reversed(down.points), first, *up.points]
     interrupted, slopes = down.interrupted or up.interrupted, None
+    if derivatives and not interrupted:
+        try:
+            stage("differentiating special points")
+            slopes = derivatives_of_special_points(family, along)
+        except KeyboardInterrupt:
+            interrupted = True
     if interrupted:
         warnings.warn(f"Interrupted: the branch has the {len(along)} cycles that were computed by then.", stacklevel=2)
-    elif derivatives:
-        stage("differentiating special points")
-        slopes = derivatives_of_special_points(family, along)
     return labelled(_dataset(family, along, slopes), final, parameter=parameter).assign_attrs(
         parameter=parameter, begins=down.ending, ends=up.ending, interrupted=int(interrupted)
     )

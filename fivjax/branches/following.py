@@ -33,8 +33,8 @@ def follow_branch(family: Family, start: BranchPoint, sense: float, most: int) -
     """The branch in one direction from a cycle, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
     front = _Front(family, start, sense)
     while len(front.points) < most:
-        stage(f"following, {len(front.points)} cycles so far")
         try:
+            stage(f"following, {len(front.points)} cycles so far")
             ended = front.advance()
         except KeyboardInterrupt:
             return front.ended(front.here, "it was interrupted")._replace(interrupted=True)

@@ -23,7 +23,7 @@ class Cea:
     """Complex eigenvalue analysis: frequencies and growth rates over one parameter (Fig. 3). Writes OUT.nc and OUT.png."""
 
     x: Annotated[str, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = "mu=0:0.5:501"
-    """parameter to follow the modes along: any of the scene's"""
+    """parameter to follow the modes along: any of the scene's that linear theory knows"""
     out: Path = Path("cea")
     """files to write, without suffix"""
     overwrite: Overwrite = False
@@ -84,7 +84,7 @@ class Calibrate:
     regime: Literal["sliding", "kick", "limit cycle"] = "kick"
     """what was recorded: a small motion about sliding, the response to the scene's kick, or a steady vibration"""
     sampling: Literal["points", "averages"] = "points"
-    """what a sample is: the value at its instant, or the mean over the time between samples"""
+    """what a sample is: the value at its instant, or the mean from half a step before to half a step after it"""
     filter: Annotated[str | None, tyro.conf.arg(metavar="CUTOFF:ORDER")] = None
     """anti-alias filter in front of the sampler: a Butterworth low-pass of this cut-off (Hz) and order, such as `400:4`"""
     y0: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT …")] = None

@@ -39,7 +39,7 @@ class StructureOptions(SceneOptions):
     contact: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NODE:ALONG:AWAY[:AGAINST] …")] = ()
     """contacts without a file, such as `17:x:-z`, or `17:x:-z:903` against another node"""
     load: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NODE:DIRECTION[=SHARE] …")] = ()
-    """where --force acts, such as `903:-z`, or `903:-z=0.5 904:-z=0.5`"""
+    """where --force acts, such as `903:z`, or `903:z=0.5 904:z=0.5`"""
     rayleigh: Annotated[tuple[float, float], tyro.conf.arg(metavar="A B")] = (0.0, 0.0)
     """damping that is added as A·M + B·K (1/s, s)"""
     damping_ratio: float = 0.0
@@ -61,7 +61,7 @@ class StructureOptions(SceneOptions):
         if not self.load:
             raise ValueError(
                 "Option `--load` is missing: nothing presses the contacts together. Name where the load acts, such as "
-                "`--load 903:-z`."
+                "`--load 903:z`."
             )
         return self._around(self.reduced())
 

@@ -26,8 +26,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..foundation.carried import depending_on
+from ..foundation.jaxprs import with_code_once
 from ..foundation.linear_solve import solve
-from .mechanics import Mechanics
 from .mode_forces import mode_matrix
 
 STICK, FORWARD, BACKWARD, OPEN = range(4)
@@ -39,7 +39,7 @@ TIE = {"float64": 1e-12, "float32": 1e-5}
 class ContactProblem(NamedTuple):
     """The laws of contact at one instant; everything but the compliances has an axis over the contacts."""
 
-    mechanics: Mechanics
+    compliance: tuple[Float[Array, "c c"], Float[Array, "c c"], Float[Array, "c c"]]  # G, as `Mechanics` has it
     tangential: Float[Array, " c"]  # b
     normal: Float[Array, " c"]
     sliding: Float[Array, " c"]  # coefficient of friction where a contact slips
@@ -60,7 +60,7 @@ def forces_of(problem: ContactProblem, state: Int[Array, " c"]) -> tuple[Float[A
     """(T, N) that the states demand, whether or not they are admissible."""
     sticking, closed = state == STICK, state != OPEN
     sign = jnp.where(state == FORWARD, 1.0, jnp.where(state == BACKWARD, -1.0, 0.0))
-    matrix = mode_matrix(problem.mechanics, sticking, closed, sign * problem.sliding)
+    matrix = mode_matrix(problem.compliance, sticking, closed, sign * problem.sliding)
     asked = jnp.sum(jnp.where(state[:, None] == np.arange(4), problem.otherwise, 0.0), axis=-1)
     right_t = jnp.where(sticking, -problem.tangential, asked)
     right_n = jnp.where(closed, -problem.normal, problem.open_normal)
@@ -73,7 +73,7 @@ def margins(problem: ContactProblem, state: Int[Array, " c"]) -> tuple[Float[Arr
     infinite where there is no condition.
     """
     holding, normal_force = forces_of(problem, state)
-    g_tt, g_tn, g_nn = problem.mechanics.compliance
+    g_tt, g_tn, g_nn = problem.compliance
     along = problem.tangential + g_tt @ holding + g_tn @ normal_force
     apart = problem.normal + g_tn.T @ holding + g_nn @ normal_force
     edge = problem.static * normal_force
@@ -104,9 +104,13 @@ def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " 
 
 def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
     """The admissible states of all contacts, or the states that come closest to it; `start` is a guess."""
+    return fivjax_settled_states(*jax.lax.stop_gradient((problem, start)))
+
+
+@with_code_once
+def fivjax_settled_states(problem, start):
     # Combinations are tried for up to this many contacts: of 256 few are allowed.
     most_enumerated = 4
-    problem, start = jax.lax.stop_gradient((problem, start))
     return (enumerated if len(start) <= most_enumerated else pivoted)(problem, start)
 
 
@@ -191,8 +195,11 @@ def pivoted(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"
             step < 4 * count, jax.lax.argmax(violation, 0, jnp.int32), jax.lax.argmax(violation > 0, 0, jnp.int32)
         )
         mine = np.arange(count) == chosen
-        options = jnp.where(mine, jnp.arange(4, dtype=jnp.int32)[:, None], state)
-        own = jax.vmap(lambda option: jnp.sum(jnp.where(mine, _judged(problem, option), 0.0)))(options)
+
+        def own_violation(option) -> Float[Array, ""]:
+            return jnp.sum(jnp.where(mine, _judged(problem, jnp.where(mine, option, state)), 0.0))
+
+        own = jax.lax.map(own_violation, jnp.arange(4, dtype=jnp.int32))
         # Its present state is excluded, whatever rounding says.
         own = jnp.where(jnp.arange(4) == jnp.sum(jnp.where(mine, state, 0)), jnp.inf, own)
         change = jax.lax.argmin(own, 0, jnp.int32)

@@ -33,7 +33,7 @@ class ModeForces(eqx.Module):
         self.of_one = self.inverse = None
         if mechanics.several:
             sticking, closed = contact.status == Status.STICK, contact.status != Status.DETACH
-            self.inverse = inverse(mode_matrix(mechanics, sticking, closed, self.signed_friction))
+            self.inverse = inverse(mode_matrix(mechanics.compliance, sticking, closed, self.signed_friction))
         else:
             self.of_one = _OneContact(mechanics, contact, mu)
 
@@ -75,10 +75,13 @@ class ModeForces(eqx.Module):
 
 
 def mode_matrix(
-    mechanics: Mechanics, sticking: Bool[Array, " c"], closed: Bool[Array, " c"], signed_friction: Float[Array, " c"]
+    compliance: tuple[Float[Array, "c c"], ...],
+    sticking: Bool[Array, " c"],
+    closed: Bool[Array, " c"],
+    signed_friction: Float[Array, " c"],
 ) -> Float[Array, "k k"]:
     """The matrix of the system for the forces of several contacts; rows and columns are all T, then all N."""
-    g_tt, g_tn, g_nn = mechanics.compliance
+    g_tt, g_tn, g_nn = compliance
     one = jnp.eye(sticking.shape[0], dtype=g_tt.dtype)
     slides = jnp.where(closed & ~sticking, -signed_friction, 0.0)
     stuck, touching = sticking[:, None], closed[:, None]

@@ -77,7 +77,7 @@ def _mode_problem(
     along, apart = _sizes_of_free(mechanics, load, y)
     force_size, change_size = _sizes(mechanics, along, apart, mechanics.rest)
     return ContactProblem(
-        mechanics=mechanics,
+        compliance=mechanics.compliance,
         tangential=free[mechanics.tangential],
         normal=free[mechanics.normal],
         sliding=sliding,
@@ -104,7 +104,7 @@ def _impact_problem(mechanics: Mechanics, y: State, reached: Bool[Array, " c"] |
     nobody = jnp.zeros_like(away)
     force_size, change_size = _sizes(mechanics, jnp.abs(slip), jnp.abs(demanded))
     return ContactProblem(
-        mechanics=mechanics,
+        compliance=mechanics.compliance,
         tangential=slip,
         normal=demanded,
         sliding=mu,

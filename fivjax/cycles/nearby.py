@@ -39,7 +39,7 @@ class NearbyCycle(eqx.Module):
     **Fields:** `period` in s; `amplitude`, the peak tangential speed, in m/s; `state`, displacements (m) and velocities (m/s)
     on the section; `residual`, how far the return is from the start, relative to the cycle's size; `found`, whether it closes
     (to 1e-10), not before as many crossings of the section, with the contact mode that the known one has there: if not, all
-    else is NaN, and `fj.limit_cycle(scene, start=cycle)` may find it; `multipliers` of the section's
+    else but `residual` is NaN, and `fj.limit_cycle(scene, start=cycle)` may find it; `multipliers` of the section's
     return map, largest first, without the one that is 1 for a deviation along the cycle; None unless asked for.
 
     **Example:**

@@ -2,7 +2,7 @@
 
 import functools
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,15 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 # What depends on what in traced functions, while these are there: loops inside loops are asked again and again.
 _known_dependence: weakref.WeakKeyDictionary[Jaxpr, dict[tuple[bool, ...], list[bool]]] = weakref.WeakKeyDictionary()
+
+# The names of functions `with_code_once`.
+CODE_ONCE: set[str] = set()
+
+
+def with_code_once(function: Callable) -> Callable:
+    """`jax.jit` of a function that kernels do not write out at each call (`cpp_calls`), as it is long."""
+    CODE_ONCE.add(function.__name__)
+    return jax.jit(function)
 
 
 def within(params) -> ClosedJaxpr | None:

@@ -1,8 +1,8 @@
 """Recordings: measured signals with their time base, and what is known of the run they came from.
 
 A recording is read from a file (`recording_files`) or made from arrays (`Recording`). It says how it was sampled: at points
-in time, as an accelerometer's converter does, by averages over the time from one sample to the next, or either after a
-low-pass. A model is sampled in the same way before the two are compared, so nothing that a sample is not is fitted to it.
+in time, as an accelerometer's converter does, by averages about each sample's instant, or either after a low-pass.
+A model is sampled in the same way before the two are compared, so nothing that a sample is not is fitted to it.
 """
 
 import math

@@ -62,7 +62,7 @@ def read_structure(
     - `labels`: node and direction of each row where the files do not say (OUTPUT4, Matrix Market, Harwell-Boeing, MATLAB,
       NumPy): pairs, or a text file with two columns.
     - `contacts`: see `fj.NodeContact`; or a file with the columns node, along, away (directions) and perhaps against (a node).
-    - `load`: share of a positive load by node and direction: `{(903, "z"): -1.0}`, without unit.
+    - `load`: share of a positive load by node and direction: `{(903, "z"): 1.0}`, without unit.
     - `rayleigh`: damping that is added as a·M + b·K, a in 1/s and b in s.
 
     **Returns:** a `SparseStructure`. Matrices that are not symmetric or not definite are read and reported by its `checks`.
@@ -111,7 +111,9 @@ def read_structure(
         matrices["damping"] + rayleigh[0] * matrices["mass"] + rayleigh[1] * matrices["stiffness"]
     ).tocsr()
     if not matrices["damping"].nnz:
-        remarks.append("There is no damping: give a damping matrix, or `rayleigh`.")
+        remarks.append(
+            "The matrices have no damping: give a damping matrix, `rayleigh`, or a damping ratio of the modes."
+        )
     tangential, normal = contact_directions(contacts, order, len(directions))
     return SparseStructure(
         **matrices,

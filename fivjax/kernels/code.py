@@ -12,10 +12,10 @@ import numpy as np
 from jax.interpreters import partial_eval
 
 from ..foundation.argument_forms import Form
-from ..foundation.jaxprs import of_scan
+from ..foundation.jaxprs import CODE_ONCE, of_scan
 from ..foundation.plain_trees import from_text, structure_to_text
 from ..foundation.precision import own_settings
-from . import cpp_elimination, cpp_loops, cpp_places, cpp_reductions
+from . import cpp_calls, cpp_elimination, cpp_loops, cpp_places, cpp_reductions
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural
 from .cpp_lanes import ADDING, OF_LANES, REALS
 from .cpp_numbers import WIDE, converted, kind_of
@@ -162,7 +162,8 @@ class _WriterOfKernel:
         self.kind = REALS if lanes else "double"
         names = ("shared", "given", "instants", "rows")
         types = {**dict.fromkeys(names, self.kind), "dots": WIDE, "row_dots": WIDE}
-        self.writer = Writer(RULES, cpp_elimination.CALLS, types, lanes)
+        calls = cpp_elimination.CALLS | dict.fromkeys(CODE_ONCE, cpp_calls.called)
+        self.writer = Writer(RULES, calls, types, lanes)
 
     def source(self, consts) -> str:
         writer, jaxpr = self.writer, self.jaxpr

@@ -78,7 +78,12 @@ class Writer:
 
     @property
     def source(self) -> str:
-        return "\n".join([*self.functions.values(), *fused([*self._before, *self.lines])])
+        return "\n".join([*self.functions.values(), self.body])
+
+    @property
+    def body(self) -> str:
+        """The code without the functions that it calls."""
+        return "\n".join(fused([*self._before, *self.lines]))
 
     def put(self, line: str) -> None:
         self.lines.append("  " * len(self._blocks) + line)

@@ -47,7 +47,7 @@ TOLERANCE = 1e-5
 
 
 class SmallestKick(NamedTuple):
-    """The smallest kick found, and a bound below which every kick is proved to slide.
+    """The smallest kick found, and a bound: kicks with p from 1 up to it are proved to slide.
 
     **Example:**
 
@@ -86,7 +86,7 @@ class SmallestKick(NamedTuple):
         found, certified = apart(self.p, self.certified, digits=9)
         return (
             f"smallest kick found: p = {found} for {self.duration:.6g} s leads to a limit cycle\n"
-            f"certified: every kick with p below {certified} slides for ever\n"
+            f"certified: every kick with p from 1 to {certified}, of durations within the bounds, slides for ever\n"
             f"gap: {self.p - self.certified:.3g}; the bound is {100 * self.ratio:.3g} % of what was found"
         )
 
@@ -129,7 +129,8 @@ def smallest_kick(
     pieces: int = 16,
     progress: bool | None = None,
 ) -> "SmallestKick | SmallestPerturbation":
-    """The smallest perturbation that leads to a limit cycle, and a certified bound below which none does.
+    """The smallest perturbation that leads to a limit cycle, and a certified bound below which none does. Of kicks, those that
+    raise the load: p is 1 or more.
 
         print(fj.smallest_kick(scene))                  # the p of a kick, over its duration
         print(fj.smallest_kick(scene, over="state"))    # the energy of an initial state
@@ -238,7 +239,7 @@ def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], piec
 
 
 def _bounds(name: str, pair) -> tuple[float, float]:
-    least, example = {"p": (1.0, "(1.0, 2.0)"), "duration": (0.0, "(0.0, 0.1)")}[name]
+    least, example = (1.0, "(1.0, 2.0)") if name == "p" else (0.0, "(0.0, 0.1)")
     return arguments.pair(f"bounds[{name!r}]", pair, example, minimum=least)
 
 
@@ -322,7 +323,8 @@ def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
         kicked = (1 - np.exp(np.outer(after, rates))) * (shares * modal)
         gap = after[1] - after[0] if len(after) > 1 else 0.0
         peak = max(peak, float(np.max(_peaks(kicked, envelope))) + 0.5 * slope * gap)
-        least = min(least, margin / peak if peak > 0 else np.inf)
+        # What does nothing, as a kick of zero duration, has a peak of rounding.
+        least = min(least, margin / peak if peak > 1e-14 * margin else np.inf)
     return float(least)
 
 

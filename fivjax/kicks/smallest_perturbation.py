@@ -6,6 +6,7 @@ closest, in the norm. The search goes in this direction as long as the size fall
 sliding suggests.
 """
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -129,7 +130,12 @@ class NoSquealingKick(ValueError):
         self.certified = certified
 
     def __str__(self) -> str:
-        return f"{self.args[0]} Below {self.certified:.6g}, the certified bound, none does."
+        bound = (
+            f"Below {self.certified:.6g}, the certified bound,"
+            if math.isfinite(self.certified)
+            else "Of whatever size,"
+        )
+        return f"{self.args[0]} {bound} none does."
 
 
 class _Rays:

@@ -36,7 +36,8 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
 
     - `system`: a structure, or a scene where friction depends on speed.
     - `**parameters`: two axes, each one-dimensional and strictly increasing, by name: `mu` or a parameter of the
-      structure; for a scene, anything in `scene.parameters`. Single numbers replace the system's own value.
+      structure; for a scene, anything in `scene.parameters` that steady sliding depends on. Single numbers replace the
+      system's own value.
     - `direction`: for a structure, +1 for a belt that moves along the tangential coordinate, -1 against it.
 
     **Returns:** a dataset over the two axes with `growth_rate` (1/s, of the fastest growing mode), `frequency` of

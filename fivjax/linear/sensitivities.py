@@ -40,6 +40,8 @@ class Sensitivity(Mapping):
         self.normalised = dict(zip(names, dataset["normalised"].values.tolist(), strict=True))
 
     def __getitem__(self, name: str) -> float:
+        if name not in self.plain:
+            raise KeyError(f"There is no parameter {name!r}.{arguments.did_you_mean(name, self.plain)}")
         return self.plain[name]
 
     def __iter__(self) -> Iterator[str]:

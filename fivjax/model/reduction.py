@@ -53,7 +53,7 @@ def craig_bampton(
     structure: SparseStructure,
     up_to: float,
     *,
-    keep: Sequence[tuple[int, int] | int] = (),
+    keep: Sequence[tuple[int, int | str] | int] = (),
     damping_ratio: float = 0.0,
 ) -> Reduction:
     """A structure reduced onto its contacts, its load and its modes up to a frequency.
@@ -69,7 +69,7 @@ def craig_bampton(
 
     - `structure`: as `fj.read_structure` gives it, with at least one contact.
     - `up_to`: the frequency in Hz up to which modes with held contacts are kept.
-    - `keep`: further coordinates to keep, by node and direction (or by index where there are no labels).
+    - `keep`: further coordinates to keep, by node and direction, such as (7, "z") (or by index where there are no labels).
     - `damping_ratio`: damping to add, the same share of critical damping in each mode of the reduced structure without contact.
 
     **Returns:** a `Reduction`.
@@ -109,7 +109,7 @@ def craig_bampton(
             )
     if not arguments.is_listed(keep):
         raise TypeError(
-            f"Argument `keep` must be a list of coordinates, such as `[(7, 3)]`, but is {arguments.describe(keep)}."
+            f"Argument `keep` must be a list of coordinates, such as `[(7, 'z')]`, but is {arguments.describe(keep)}."
         )
     directions = np.hstack([structure.tangential_directions, structure.normal_directions])
     kept = np.any(directions != 0, axis=1)
@@ -221,8 +221,12 @@ def _index(structure: SparseStructure, place) -> int:
         if not 0 <= place < structure.size:
             raise ValueError(f"Argument `keep` must hold indices below {structure.size}, but holds {place}.")
         return int(place)
-    if structure.labels is None or not arguments.is_listed(place) or tuple(place) not in structure.labels:
-        raise ValueError(
-            f"Argument `keep` must hold coordinates of the structure by node and direction, but holds {place!r}."
-        )
-    return structure.labels.index(tuple(place))
+    if structure.labels is not None and arguments.is_listed(place) and len(place) == 2:
+        node, direction = place
+        axes = {"x": 1, "y": 2, "z": 3}
+        label = node, axes.get(direction, direction) if isinstance(direction, str) else direction
+        if label in structure.labels:
+            return structure.labels.index(label)
+    raise ValueError(
+        f"Argument `keep` must hold coordinates of the structure by node and direction, but holds {place!r}."
+    )

@@ -47,8 +47,8 @@ class Scene(eqx.Module):
     - `load`: `ConstantLoad`, `Pulse` or a load of your own; `ConstantLoad()` unless given.
     - `restitution`: Newton's coefficient for the closing gap, 0 (inelastic) to 1. One number, or one for each contact.
     - `impact_law`: what happens where the gap closes: "coulomb" (an impulse with Coulomb friction), "frictionless" (an impulse
-      along the normal alone) or "reset" (the gap stops closing, all other velocities stay, of a contact given by vectors
-      those of `in_contact_coordinates`).
+      along the normal alone) or "reset" (of the velocities in `in_contact_coordinates`, the gap's alone changes: it
+      reverses, times `restitution`).
 
     **Raises:** `TypeError` or `ValueError`, as a sentence, for parts of the wrong kind or values out of range.
 
@@ -126,7 +126,8 @@ class Scene(eqx.Module):
 
     def parameters_of(self, part: str) -> dict[str, Array]:
         """Those of a part: "scene", "friction law", "load" or "structure"."""
-        return self._parameters_of_parts()[part]
+        arguments.one_of("part", part, parts := self._parameters_of_parts())
+        return parts[part]
 
     def _parameters_of_parts(self) -> dict[str, dict[str, Array]]:
         friction, load = map(numeric_fields, (self.friction, self.load))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.branches import following, pseudo_arclength, special_derivatives, verification
+from fivjax.branches import continuation, following, pseudo_arclength, special_derivatives, verification
 from fivjax.branches.multiple_shooting import Mode
 from fivjax.branches.special_points import pairing
 from fivjax.model import own_structures
@@ -553,6 +553,17 @@ def test_an_interrupted_branch_has_what_was_computed(monkeypatch, after):
     assert 3 <= part.sizes["point"] < whole.sizes["point"] and "d_special" not in part
     places = np.searchsorted(whole["parameter"].values, part["parameter"].values)
     np.testing.assert_array_equal(whole.isel(point=places)["amplitude"], part["amplitude"])
+
+
+def test_a_branch_that_is_interrupted_at_its_derivatives_has_all_cycles(monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(continuation, "derivatives_of_special_points", interrupted)
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.ConstantLoad(100.0))
+    with pytest.warns(UserWarning, match="Interrupted: the branch has the"):
+        branch = fj.continue_cycle(scene, "mu", (0.22, 0.23), points=3, derivatives=True)
+    assert branch.attrs["interrupted"] == 1 and branch.sizes["point"] >= 4 and "d_special" not in branch
 
 
 def test_a_change_of_modes_lies_between_its_neighbours(monkeypatch):

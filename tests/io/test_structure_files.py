@@ -384,7 +384,7 @@ def test_what_is_wrong_with_a_model_is_said(folder, tmp_path):
             np.array([[1.0, 0, 1], [0, -2, 0], [1, 0, 0]]),
             np.diag([1.0, 1, 0]),
         ),
-        "There is no damping": (free, np.eye(3)),
+        "The matrices have no damping": (free, np.eye(3)),
     }
     for sentence, (stiffness, mass) in cases.items():
         np.savez(tmp_path / "wrong.npz", K=stiffness, M=mass)

@@ -74,6 +74,15 @@ def test_what_has_no_bound_is_refused():
         fj.smallest_kick(SCENE.replace(mu=0.25))
 
 
+def test_a_kick_of_no_duration_is_none_of_whatever_size():
+    """The beginning may be free, and has no effect."""
+    with pytest.raises(fj.NoSquealingKick, match="Of whatever size, none does") as none:
+        fj.smallest_kick(
+            SCENE.replace(duration=0.0), over=("p", "start"), bounds={"p": (1.0, 1.2), "start": (0.0, 1.0)}, p_step=0.1
+        )
+    assert none.value.certified == np.inf
+
+
 @pytest.mark.slow
 def test_the_paper_s_smallest_kick_is_certified_to_more_than_half():
     kick = fj.smallest_kick(SCENE, bounds={"p": (1.0, 1.3)})
