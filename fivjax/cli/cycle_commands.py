@@ -10,7 +10,7 @@ import tyro
 import fivjax as fj
 
 from ..foundation.digits import apart
-from .outputs import Failure, Interrupted, Overwrite, output_paths, write_data, write_picture
+from .outputs import Failure, Interrupted, Overwrite, import_writers, output_paths, write_data, write_picture
 from .parsing import axis, bound
 from .structure_options import StructureOptions
 
@@ -90,6 +90,7 @@ class Branch:
         labels = [""] if other is None else [f"{other} = {value}" for value in apart(*values)]
         # Before the first branch is computed, all are checked.
         scenes = [scene if other is None else scene.replace(**{other: value}) for value in values]
+        import_writers()
         for here, label, path in zip(scenes, labels, data, strict=False):
             try:
                 with warnings.catch_warnings():

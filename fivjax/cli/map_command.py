@@ -1,6 +1,7 @@
 """`fivjax map`: a bi-stability map over two parameters."""
 
 import dataclasses
+import gc
 import importlib
 import shutil
 import threading
@@ -24,6 +25,17 @@ def _folder(words: list[str]) -> Path:
     if len(words) > 1:
         raise ValueError(f"it takes one folder, but there are {len(words)}")
     return Path(*words)
+
+
+def import_what_draws() -> None:
+    """Import `fivjax.plot` beside other work, without collections of garbage. Those may run Python; and a thread that gave
+    Python away while it holds the system's loader of libraries would wait for ever for one that waits for this loader.
+    """
+    gc.disable()
+    try:
+        importlib.import_module("fivjax.plot")
+    finally:
+        gc.enable()
 
 
 # The option `--resume` without a value gives an empty path.
@@ -87,7 +99,7 @@ class Map:
         # The name of an option of maps would be taken for that.
         checked_axes(scene, axes)
         # What draws is imported while kernels are compiled and run, which leaves Python to it.
-        threading.Thread(target=importlib.import_module, args=("fivjax.plot",), daemon=True).start()
+        threading.Thread(target=import_what_draws, daemon=True).start()
         try:
             with warnings.catch_warnings(), workers_of(self.workers, self.dask) as executor:
                 # The message printed below says more.

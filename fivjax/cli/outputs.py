@@ -50,6 +50,12 @@ def refuse_existing(*paths: Path) -> None:
         )
 
 
+def import_writers() -> None:
+    """Import what writes data, so that what an interrupt leaves is written: in an import a signal ends a command at once."""
+    import h5netcdf.legacyapi  # noqa: F401
+    import xarray.backends.h5netcdf_  # noqa: F401
+
+
 def write_data(result, path: Path) -> None:
     """Save a result, and print where at once: it is there if what follows is interrupted."""
     fj.save(result, path)

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 from ..foundation.jaxprs import within
 from .cpp_arrays import Value, View, natural
+from .cpp_fused import fused
 from .cpp_numbers import kind_of
 from .cpp_writer import Writer
 
@@ -42,7 +43,8 @@ def _function(writer: Writer, name: str, traced) -> str:
     told = ", ".join(
         [*(f"const {view.kind}* {view.base}" for view in takes), *(f"{view.kind}* {view.base}" for view in gives)]
     )
-    text = f"[&]({told}) __attribute__((noinline)) {{\n{own.body}\n}};"
+    body = "\n".join(fused([*own.before, *own.lines]))
+    text = f"[&]({told}) __attribute__((noinline)) {{\n{body}\n}};"
     writer.functions.update(own.functions)
     for known, has in writer.functions.items():
         if has == f"const auto {known} = {text}":

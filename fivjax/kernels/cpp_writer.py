@@ -70,7 +70,7 @@ class Writer:
         # Blocks that are open, each with what has been computed in it: the same text is the same number.
         self._blocks: list[dict] = [{}]
         # Code that comes before, what it has computed, and the arrays that are known there: at first what the code is given.
-        self._before: list[str] = []
+        self.before: list[str] = []
         self._once: dict = {}
         self._known_before = {name for name in GIVEN if name in self.types}
 
@@ -78,12 +78,7 @@ class Writer:
 
     @property
     def source(self) -> str:
-        return "\n".join([*self.functions.values(), self.body])
-
-    @property
-    def body(self) -> str:
-        """The code without the functions that it calls."""
-        return "\n".join(fused([*self._before, *self.lines]))
+        return "\n".join([*self.functions.values(), *fused([*self.before, *self.lines])])
 
     def put(self, line: str) -> None:
         self.lines.append("  " * len(self._blocks) + line)
@@ -133,7 +128,7 @@ class Writer:
             return write()
         if key not in self._once:
             here = self.lines, self._blocks
-            self.lines, self._blocks = self._before, [{}]
+            self.lines, self._blocks = self.before, [{}]
             found = self._once[key] = write()
             self.lines, self._blocks = here
             self._known_before.add(found.base)

@@ -16,8 +16,8 @@ from .warp_library import compiler_flags
 # optimisation is for what nearly every call runs for long, and for vectors, as of lanes side by side: these would run fifteen
 # times as long without any.
 QUICKLY, SOMEWHAT, THOROUGHLY = "-O0", "-O1", "-O3"
-# About what it takes to compile thoroughly, in seconds for each character of code.
-WORTH = 6e-6
+# About what it takes to compile thoroughly: seconds for each character of code, and for the square of long code's.
+WORTH, WORTH_OF_LONG = 6e-6, 2e-11
 
 
 class TieredFunction:
@@ -37,7 +37,9 @@ class TieredFunction:
         run(*args)
         if not self._is_thorough:
             self._spent += time.perf_counter() - begin
-            if self._spent > WORTH * len(self._told[0]) and self._making.acquire(blocking=False):
+            length = len(self._told[0])
+            worth = max(WORTH * length, WORTH_OF_LONG * length**2)
+            if self._spent > worth and self._making.acquire(blocking=False):
                 # Where it cannot be compiled any more, as on a full disk, it goes on as it is.
                 try:
                     self._compile(thoroughly=True)

@@ -21,7 +21,7 @@ from .base import AbstractStepper
 from .event_exact import EventExact
 
 # Larger structures and more contacts are left to XLA: their kernels would have more code than they save.
-LARGEST, MOST_CONTACTS = 48, 4
+LARGEST, MOST_CONTACTS = 48, 8
 # The latest version of JAX whose primitives are known to have C++. In a later one it is looked whether a step has.
 LATEST_JAX = (0, 12)
 

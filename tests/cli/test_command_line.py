@@ -1,5 +1,6 @@
 """The command line beside its refusals: start, version, what it says while it works and at its end."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 import xarray as xr
 
 import fivjax as fj
-from fivjax.cli import cycle_commands, main
+from fivjax.cli import cycle_commands, main, map_command
 from fivjax.cli.analysis_commands import with_options
 from fivjax.cli.options import SceneOptions
 from fivjax.io.datasets import labelled
@@ -166,6 +167,14 @@ def test_cea_of_falling_friction_says_whether_this_scene_slides(tmp_path, capsys
         f"growth rate of this scene {growth:.6g} 1/s, so steady sliding is unstable; if friction were constant:" in said
     )
     assert said.index("if friction were constant") < said.index("critical friction")
+
+
+def test_what_draws_is_imported_without_collections_of_garbage(monkeypatch):
+    """One inside the loader of a library could hand Python to a thread that waits for the loader."""
+    seen = []
+    monkeypatch.setattr(map_command.importlib, "import_module", lambda name: seen.append((name, gc.isenabled())))
+    map_command.import_what_draws()
+    assert seen == [("fivjax.plot", False)] and gc.isenabled()
 
 
 def test_an_interrupted_branch_is_written(monkeypatch, tmp_path, capsys):

@@ -118,6 +118,7 @@ def test_where_nothing_more_can_be_compiled_it_goes_on_as_it_is(monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(tiered, "WORTH", 0.0)
+    monkeypatch.setattr(tiered, "WORTH_OF_LONG", 0.0)
     monkeypatch.setattr(tiered, "c_function", full)
     assert [tripled(function) for _ in range(3)] == [4.5] * 3 and len(tried) == 1
 
