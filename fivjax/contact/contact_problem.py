@@ -104,13 +104,9 @@ def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " 
 
 def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
     """The admissible states of all contacts, or the states that come closest to it; `start` is a guess."""
-    return fivjax_settled_states(*jax.lax.stop_gradient((problem, start)))
-
-
-@with_code_once
-def fivjax_settled_states(problem, start):
     # Combinations are tried for up to this many contacts: of 256 few are allowed.
     most_enumerated = 4
+    problem, start = jax.lax.stop_gradient((problem, start))
     return (enumerated if len(start) <= most_enumerated else pivoted)(problem, start)
 
 
@@ -124,6 +120,7 @@ class _Search(NamedTuple):
     best: Int[Array, " c"]
 
 
+@jax.jit
 def enumerated(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
     """By trying combinations. Ties go to the one that changes the fewest states of `start`, then to the most sticking.
 
@@ -177,6 +174,7 @@ def _preference(states: tuple[int, ...]) -> tuple[int, int]:
     return -states.count(STICK), states.count(OPEN)
 
 
+@with_code_once
 def pivoted(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
     """By principal pivoting: in each step one contact whose state is not admissible takes a state that is, given the others'.
 

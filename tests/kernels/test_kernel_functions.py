@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fivjax.foundation.argument_forms import Form
+from fivjax.foundation.jaxprs import with_code_once
 from fivjax.foundation.linear_solve import solve
 from fivjax.foundation.numpy_evaluation import by_numpy
 from fivjax.kernels.functions import KernelFunction
@@ -381,6 +382,39 @@ def test_what_follows_from_what_is_given_is_computed_once_before_all_loops():
     assert before.count("wp::abs(given[") == 1 and "wp::abs(" not in after
     # Rows of the matrix become columns, whose numbers a loop over results reads side by side.
     assert not re.search(r"given\[\w+ \* 9", after)
+
+
+@with_code_once
+def _nearest(points, at, allowed, first):
+    """A whole number, a choice, a matrix across its rows and one that is known."""
+    distances = jnp.sum(jnp.abs(points - at), axis=1) + jnp.where(allowed, 0.0, 10.0) + jnp.arange(len(points)) * 1e-3
+    place = jax.lax.while_loop(lambda k: jnp.any(distances < distances[k]), lambda k: k + 1, first)
+    return place, points[place], distances
+
+
+def test_a_function_with_its_code_once_is_called():
+    """Twice, of which it has one text; of tangents it is written out."""
+
+    def calls(args, instants):
+        points, at, scale = args
+        allowed = points[:, 0] > 0
+        one, near, sizes = _nearest(points, at, allowed, jnp.int32(0))
+        other, far, more = _nearest(points.T[::-1].T * scale, jnp.ones_like(at), ~allowed, one * 0)
+        return {"places": jnp.stack([one, other]), "near": near, "far": far, "sizes": sizes + more}, ()
+
+    random, kernels = np.random.default_rng(8), KernelFunction(calls)
+    args = random.normal(size=(17, 3)), random.normal(size=3), np.array(1.3)
+    found, _ = kernels(args)
+    with jax.enable_x64(True):
+        like = jax.tree.map(jnp.asarray, args)
+        expected, _ = calls(like, None)
+        assert np.array_equal(found["places"], expected["places"])
+        for name in ("near", "far", "sizes"):
+            np.testing.assert_allclose(found[name], expected[name], rtol=1e-14)
+        slopes = jax.jacfwd(lambda scale: kernels((like[0], like[1], scale))[0]["far"])(like[2])
+        np.testing.assert_allclose(slopes, expected["far"] / 1.3, rtol=1e-13)
+    source = kernel_of(kernels, Form.of(args)[0].kept).text.source
+    assert source.count("noinline") == 1 and source.count("_nearest_0(") == 2
 
 
 def test_what_differs_by_the_sign_of_a_zero_is_not_the_same():
