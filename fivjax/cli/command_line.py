@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
         command = tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
             prog="fivjax",
-            description="Friction-induced vibration: what a scene does after a kick. `fivjax --version` says which it is.",
+            description="Friction-induced vibration: what a scene does after a kick. `fivjax --version` prints the version.",
             args=arguments,
         )
     keep_compiled_code()

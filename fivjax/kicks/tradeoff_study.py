@@ -66,7 +66,7 @@ def tradeoff(
     **Arguments:**
 
     - `scene`: the scene; its load must be a `Pulse` for `boundary`.
-    - `methods`: steppers by their names in the table, `default_methods()` unless given.
+    - `methods`: steppers by their names in the table; unless given, `WhereSwitched` by three solvers, and `EventExact`.
     - `t1`: time after which states are compared, in s: long enough for several contact events.
     - `trajectories`: number of trajectories in the batch whose cost is measured.
     - `p`: kicks for which verdicts are compared, 24 around the critical one unless given.

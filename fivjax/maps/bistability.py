@@ -89,15 +89,17 @@ def bistability_map(
       most), to count how many results are wrong: attributes `audit_cells`, `audit_wrong`, `audit_rate`, and its 95 % interval,
       `audit_rate_low` and `audit_rate_high`.
 
-    **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
-    -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
-    tangential speed on its attractor in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s).
-    Which attractor captured a trajectory is `attractor`, an index into the table over `attractors`; `chaotic` marks undecided
-    trajectories from which neighbours diverge exponentially. With an axis p, `p_crit_low` and `p_crit_high` over the other axes
-    are the two kicks between which the limit cycle first appears, one proved to slide and one proved to end on a limit cycle,
-    and `p_crit` is their middle, NaN if undecided kicks lie between, or if already the first of the axis squeals (1 if that is
-    no kick, p = 1); `critical_perturbation` narrows that down. With an axis mu, the attribute `mu_crit` is the critical
-    friction of linear theory. If no trajectory could be followed, all for the same reason, the attribute `failure` says why.
+    **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle, -1
+    undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
+    tangential speed on its attractor in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s), and
+    what a verdict rests on, `proof` and `bound`. What is not known of a trajectory is NaN. Which attractor captured it is
+    `attractor` (-1 for none), an index into the table over `attractors`, which has the amplitude, period, kind, multiplier,
+    reach and contraction of each; `chaotic` marks undecided trajectories from which neighbours diverge exponentially. With
+    an axis p, `p_crit_low` and `p_crit_high` over the other axes are the two kicks between which the limit cycle first
+    appears, one proved to slide and one proved to end on a limit cycle, and `p_crit` is their middle, NaN if undecided
+    kicks lie between, or if already the first of the axis squeals (1 if that is no kick, p = 1); `critical_perturbation`
+    narrows that down. With an axis mu, the attribute `mu_crit` is the critical friction of linear theory. If no trajectory
+    could be followed, all for the same reason, the attribute `failure` says why.
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
     not increasing, values that the scene refuses, and a `resume` file that belongs to another run.
