@@ -38,6 +38,8 @@ def _function(writer: Writer, name: str, traced) -> str:
     takes = list(_places("x", traced.jaxpr.invars))
     gives = list(_places("y", traced.jaxpr.outvars))
     own = Writer(writer.rules, writer.calls, {view.base: view.kind for view in (*takes, *gives)}, lanes=False)
+    # Of all, so that one that this calls has a name of its own.
+    own.functions = writer.functions
     for value, view in zip(own.run(traced.jaxpr, traced.consts, list(map(own.small, takes))), gives, strict=True):
         own.copy(value, view.base, view.kind)
     told = ", ".join(
@@ -45,7 +47,6 @@ def _function(writer: Writer, name: str, traced) -> str:
     )
     body = "\n".join(fused([*own.before, *own.lines]))
     text = f"[&]({told}) __attribute__((noinline)) {{\n{body}\n}};"
-    writer.functions.update(own.functions)
     for known, has in writer.functions.items():
         if has == f"const auto {known} = {text}":
             return known

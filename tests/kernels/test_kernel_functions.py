@@ -392,15 +392,25 @@ def _nearest(points, at, allowed, first):
     return place, points[place], distances
 
 
+@with_code_once
+def _nearest_of_half(points, at):
+    return _nearest(points[::2] - 0.1, at, jnp.ones(len(points[::2]), bool), jnp.int32(0))[0]
+
+
 def test_a_function_with_its_code_once_is_called():
-    """Twice, of which it has one text; of tangents it is written out."""
+    """Twice, of which it has one text, and by another such function for another shape; of tangents it is written out."""
 
     def calls(args, instants):
         points, at, scale = args
         allowed = points[:, 0] > 0
         one, near, sizes = _nearest(points, at, allowed, jnp.int32(0))
         other, far, more = _nearest(points.T[::-1].T * scale, jnp.ones_like(at), ~allowed, one * 0)
-        return {"places": jnp.stack([one, other]), "near": near, "far": far, "sizes": sizes + more}, ()
+        return {
+            "places": jnp.stack([one, other, _nearest_of_half(points, at)]),
+            "near": near,
+            "far": far,
+            "sizes": sizes + more,
+        }, ()
 
     random, kernels = np.random.default_rng(8), KernelFunction(calls)
     args = random.normal(size=(17, 3)), random.normal(size=3), np.array(1.3)
@@ -414,7 +424,7 @@ def test_a_function_with_its_code_once_is_called():
         slopes = jax.jacfwd(lambda scale: kernels((like[0], like[1], scale))[0]["far"])(like[2])
         np.testing.assert_allclose(slopes, expected["far"] / 1.3, rtol=1e-13)
     source = kernel_of(kernels, Form.of(args)[0].kept).text.source
-    assert source.count("noinline") == 1 and source.count("_nearest_0(") == 2
+    assert source.count("noinline") == 3 and source.count("_nearest_0(") == 2
 
 
 def test_what_differs_by_the_sign_of_a_zero_is_not_the_same():
