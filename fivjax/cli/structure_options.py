@@ -149,11 +149,10 @@ def _share(text: str) -> tuple[tuple[int, str | int], float]:
         ) from None
 
 
-def _coordinate(text: str, option: str) -> tuple[int, int]:
+def _coordinate(text: str, option: str) -> tuple[int, int | str]:
     node, _, direction = text.partition(":")
-    axes = {"x": 1, "y": 2, "z": 3}
-    if node.isdecimal() and (direction in axes or direction.isdecimal()):
-        return int(node), axes.get(direction) or int(direction)
+    if node.isdecimal() and (direction in ("x", "y", "z") or direction.isdecimal()):
+        return int(node), int(direction) if direction.isdecimal() else direction
     raise ValueError(f"Option `{option}` must be NODE:DIRECTION, such as `5:x` or `5:1`, but is {text!r}.")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..foundation import arguments
+from ..model.sparse_structure import AXES
 from .file_matrix import Label, text_of
 from .files import check_there
 
@@ -168,11 +169,10 @@ def _along(node: int, direction, order, size: int) -> np.ndarray:
 
 
 def _components(direction) -> dict[int, float]:
-    axes = {"x": 1, "y": 2, "z": 3}
     if isinstance(direction, str):
         name, sign = direction.strip().lstrip("+-").lower(), -1.0 if direction.strip().startswith("-") else 1.0
-        if name in axes:
-            return {axes[name]: sign}
+        if name in AXES:
+            return {AXES[name]: sign}
     elif arguments.is_whole(direction):
         if 0 <= direction <= 6:
             return {int(direction): 1.0}

@@ -13,7 +13,7 @@ import numpy as np
 from ..foundation import arguments
 from .contact_coordinates import transformation
 from .contact_point import ContactPoint
-from .sparse_structure import SparseStructure
+from .sparse_structure import AXES, SparseStructure
 from .structure import Structure
 from .structure_checks import lowest_modes
 
@@ -223,8 +223,7 @@ def _index(structure: SparseStructure, place) -> int:
         return int(place)
     if structure.labels is not None and arguments.is_listed(place) and len(place) == 2:
         node, direction = place
-        axes = {"x": 1, "y": 2, "z": 3}
-        label = node, axes.get(direction, direction) if isinstance(direction, str) else direction
+        label = node, AXES.get(direction, direction) if isinstance(direction, str) else direction
         if label in structure.labels:
             return structure.labels.index(label)
     raise ValueError(

@@ -10,6 +10,9 @@ from .structure_checks import StructureChecks
 if TYPE_CHECKING:
     from scipy import sparse
 
+# The numbers of the directions that have letters.
+AXES = {"x": 1, "y": 2, "z": 3}
+
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class SparseStructure:
