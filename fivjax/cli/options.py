@@ -20,7 +20,7 @@ class SceneOptions:
     mu: float | None = None
     """constant friction coefficient; 0.227 unless given"""
     mu_static: float | None = None
-    """static coefficient; with --mu-dynamic, friction falls with slip speed (Eq. 1)"""
+    """static coefficient: with --mu, of constant friction; with --mu-dynamic, of friction that falls with slip speed (Eq. 1)"""
     mu_dynamic: float | None = None
     """dynamic coefficient of Eq. 1"""
     decay: float | None = None
@@ -70,6 +70,8 @@ class SceneOptions:
         given = [option for option, value in {**of_falling, "--decay": self.decay}.items() if value is not None]
         if not given:
             return fj.Coulomb(mu if self.mu is None else self.mu)
+        if given == ["--mu-static"] and self.mu is not None:
+            return fj.Coulomb(self.mu, self.mu_static)
         missing = [option for option, value in of_falling.items() if value is None]
         if missing:
             raise ValueError(

@@ -44,8 +44,8 @@ MEANING = {
     "change the restitution or the belt speed a little",
     Verdict.UNBOUNDED: "grows without bound: it sticks for ever, pressed on ever harder, or has grown a billionfold; "
     "lower the friction or the belt's inclination",
-    Verdict.STEP_FAILURE: "its fastest vibration, or its contact events, need more steps than `max_steps` to reach a verdict; "
-    "raise that, lower `t_max`, or soften what is stiffest",
+    Verdict.STEP_FAILURE: "its fastest vibration, or its contact events, need more steps to reach a verdict than are allowed "
+    "(`max_steps` of `bistability_map`); raise that, lower `t_max`, or soften what is stiffest",
     Verdict.WORKER_LOST: "three workers in a row died while they ran it; give the workers more memory, or run it alone, and "
     "define laws of your own in a module that they can import",
     Verdict.NOT_RUN: "interrupted before a verdict; run it again",

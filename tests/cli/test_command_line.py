@@ -97,6 +97,8 @@ def test_a_cycle_without_a_saddle_is_written(monkeypatch, tmp_path, capsys):
 def test_friction_options():
     """What is said of friction is used; where nothing is said it is the paper's."""
     assert float(SceneOptions().scene().friction.mu) == 0.227
+    static = SceneOptions(mu=0.2, mu_static=0.3).scene().friction
+    assert isinstance(static, fj.Coulomb) and (float(static.mu), float(static.mu_static)) == (0.2, 0.3)
     falling = SceneOptions(mu_static=0.3, mu_dynamic=0.2).scene().friction
     assert isinstance(falling, fj.ExponentialDecay) and float(falling.decay) == 0.5
     assert float(SceneOptions(mu_static=0.3, mu_dynamic=0.2, decay=0.7).scene().friction.decay) == 0.7

@@ -150,6 +150,7 @@ def test_calibrate(folder, capsys, arguments, fragments):
         (["simulate", "--theta", "90"], ["`--theta`", "rad", "90 degrees are 1.571 rad"]),
         (["simulate", "--decay", "0.3"], ["`--decay`", "`--mu-static` and `--mu-dynamic` are missing"]),
         (["simulate", "--mu-dynamic", "0.3"], ["`--mu-static` is missing"]),
+        (["simulate", "--mu", "0.3", "--mu-static", "0.2"], ["`mu_static`", "0.2", "`mu`"]),
         (["simulate", "--mu-static", "0.3", "--mu-dynamic", "0.2", "--mu", "0.1"], ["`--mu`", "`--mu-static`", "one of them"]),
         (["cea", "--belt-speed", "0"], ["`belt_speed`", "zero"]),
         (["cea", "--k1", "-1"], ["`k1`", "non-negative"]),
