@@ -6,6 +6,7 @@ Stands above the public names, which offer it: it is imported when it is first u
 from collections.abc import Sequence
 from pathlib import Path
 
+from .foundation import arguments
 from .foundation.precision import in_double_precision
 from .foundation.progress import following, stage, tick
 from .io.datasets import check_writable, labelled, save, save_figure, save_text
@@ -58,7 +59,7 @@ def reproduce(
     names = names_of(figure)
     report = "reproduce.md"
     if out is not None:
-        out = Path(out)
+        out = arguments.path("out", out)
         if not out.exists() and out.parent.is_dir():
             out.mkdir()
         check_writable(out / report)

@@ -1,9 +1,9 @@
-"""Standard deviations and correlations of parameters, and which are identifiable only in combination."""
+"""Standard deviations and correlations of parameters, and which of them go together."""
 
 import numpy as np
 from jaxtyping import Float
 
-# Parameters with a larger correlation are identifiable only in combination: one may change much if the other follows.
+# Parameters with a larger correlation go together: one may change much if the other follows.
 TOGETHER = 0.9
 
 

@@ -55,6 +55,8 @@ class CycleMisfit(AbstractMisfit):
     unknowns: int = eqx.field(static=True, default=1)
     # The zeros of the sensors.
     projected: int = eqx.field(static=True, kw_only=True)
+    # The channel whose fundamental stands out of its noise the most: phases are measured from it.
+    leading: int = eqx.field(static=True, kw_only=True)
 
     @property
     def numbers(self):
@@ -78,7 +80,7 @@ class CycleMisfit(AbstractMisfit):
         rough = self._roughly(1 / cycle.period, lines[: len(self.measured)])
         rough = jnp.concatenate([rough, times / jnp.maximum(self.fractions[:, 1], ROUGH_FRACTIONS)])
         # Where in its period the scene is at each of the measured phases.
-        shifted = jnp.angle(self.measured[0, 0]) - jnp.angle(lines[0, 0])
+        shifted = jnp.angle(self.measured[0, self.leading]) - jnp.angle(lines[0, self.leading])
         turns = self.phases + self.times * (1 / cycle.period - self.frequency)
         # What is unknown of it: in sixteenths of a period.
         turns = turns + shifted / (2 * jnp.pi) + shift[0] / 16
@@ -108,11 +110,11 @@ class CycleMisfit(AbstractMisfit):
         return lines if self.response is None else lines * self.response[:, None]
 
     def _roughly(self, frequency, lines):
-        found, wanted = _referred(lines), _referred(self.measured)
-        size = jnp.abs(self.measured[0, 0])
+        found, wanted = _referred(lines, self.leading), _referred(self.measured, self.leading)
+        size = jnp.abs(self.measured[0, self.leading])
         step = (self.frequency - frequency) / (ROUGH_FREQUENCY * self.frequency)
         apart = (wanted - found) / (ROUGH_LINES * size)
-        return jnp.concatenate([step[None], apart.real.ravel(), apart.imag.ravel()[1:]])
+        return jnp.concatenate([step[None], apart.real.ravel(), jnp.delete(apart.imag.ravel(), self.leading)])
 
     def _waveform(self, scene, cycle: Cycle, after: OnePeriod, lines, turns):
         """The channels at these turns, as they are sampled; and where they would jump if an event moved."""
@@ -166,10 +168,10 @@ def _in_period(turns):
     return jnp.where(rest >= 1, rest - 1, rest)
 
 
-def _referred(lines: Complex[Array, "h k"]) -> Complex[Array, "h k"]:
-    """The lines for a time origin at which the first channel's fundamental has phase zero."""
-    size = jnp.sqrt(lines[0, 0].real ** 2 + lines[0, 0].imag ** 2)
-    return lines * (lines[0, 0].conj() / size) ** jnp.arange(1, lines.shape[0] + 1)[:, None]
+def _referred(lines: Complex[Array, "h k"], leading: int) -> Complex[Array, "h k"]:
+    """The lines for a time origin at which this channel's fundamental has phase zero."""
+    size = jnp.sqrt(lines[0, leading].real ** 2 + lines[0, leading].imag ** 2)
+    return lines * (lines[0, leading].conj() / size) ** jnp.arange(1, lines.shape[0] + 1)[:, None]
 
 
 def misfit_of_cycle(recording: Recording, method: AbstractStepper, scene: Scene) -> CycleMisfit:
@@ -205,6 +207,7 @@ def misfit_of_cycle(recording: Recording, method: AbstractStepper, scene: Scene)
         beating=jnp.asarray(fold.sidebands),
         channels=recording.channels,
         projected=len(recording.channels),
+        leading=int(np.argmax(np.abs(fold.lines[0]) / noise)),
     )
 
 

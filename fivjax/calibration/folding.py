@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from .noise import from_third_differences, robust_deviation, rounding, taper
+from .noise import estimated_noise, from_third_differences, robust_deviation, rounding, taper
 
 # The most groups: of phases, many, so that few samples lie beside a jump; and of times. Four of these tell the frequency with
 # nearly the error of all samples: the mean square of their times is 15/16 of that of all.
@@ -52,7 +52,9 @@ def folded(
     by_harmonics, by_neighbours = 3, 3
     t = (np.arange(len(samples)) - 0.5 * (len(samples) - 1)) / rate
     size = samples.std(axis=0)
-    scaled = (samples - samples.mean(axis=0)) / np.where(size > 0, size, 1.0)
+    # Where there is little but noise, a channel says little of the frequency and of beats.
+    vibrating = 1 - (estimated_noise(samples) / np.where(size > 0, size, 1.0)) ** 2
+    scaled = (samples - samples.mean(axis=0)) / np.where(size > 0, size, 1.0) * np.clip(vibrating, 1e-3, 1.0) ** 2
     frequency = _strongest(scaled, 1 / rate, lowest, highest)
     count = max(1, min(MOST_HARMONICS, len(samples) // 8))
     for k in range(by_harmonics + by_neighbours):

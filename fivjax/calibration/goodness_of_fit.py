@@ -18,7 +18,7 @@ UNLIKELY = 5.0
 # Number of lags tested together, in blocks; about a period of a vibration.
 LAGS = 16
 IMPROBABLE = 1e-6
-# What is left of a recording without noise is rounding, which is alike from block to block.
+# What is left of a recording without noise is rounding.
 ROUNDING = 1e-6
 
 
@@ -55,8 +55,10 @@ def residual_tests(
     misfit = squares / freedom
     # The relative error of a variance is twice that of a standard deviation.
     scatter = np.hypot(np.sqrt(2.0 / freedom), 0.0 if stated else 2 * ESTIMATE_ERROR)
-    least = ROUNDING if stated else of_estimate
-    found = [_likeness(column) for left in waveforms for column in left if len(column) > 3 and misfit > least]
+    columns = [np.asarray(column) for left in waveforms for column in left if len(column) > 3]
+    # Beside a stated noise, what is left of N blocks may be alike if its power is less than a share 1/N: parameters are off by
+    # less than their standard deviations.
+    found = [_likeness(one) for one in columns if np.mean(one**2) > (1 / len(one) if stated else of_estimate)]
     correlation, correlated = max(found, key=lambda one: (one[1], abs(one[0])), default=(0.0, False))
     return ResidualTests(
         misfit=misfit,

@@ -114,7 +114,9 @@ class Calibration(eqx.Module):
 
     @property
     def combinations(self) -> list[tuple[tuple[str, ...], float]]:
-        """Parameters that are identifiable only in combination: groups of names, and the largest correlation of each group."""
+        """Parameters of which one may change much if the others follow: groups of names, and the largest correlation of each
+        group.
+        """
         return combinations(self.names, self.correlation) if self.converged else []
 
     def value_text(self, name: str) -> str:
@@ -137,7 +139,9 @@ class Calibration(eqx.Module):
             said.append(f"  what is left: {self.left}")
         said += [f"  {name:<12}{self.value_text(name)}" for name in self.names]
         for group, correlation in self.combinations:
-            said.append(f"  {', '.join(group)}: identifiable only in combination (correlation {correlation:.3f})")
+            alone = all(self.identifiable[name] for name in group)
+            how = "known, but their errors go together" if alone else "identifiable only in combination"
+            said.append(f"  {', '.join(group)}: {how} (correlation {correlation:.3f})")
         for k, offset in enumerate(self.offsets):
             if offset is not None:
                 error = f"{offset[1]:.2g}" if np.isfinite(offset[1]) else "not known"

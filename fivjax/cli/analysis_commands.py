@@ -10,8 +10,8 @@ import tyro
 import fivjax as fj
 
 from .options import SceneOptions
-from .outputs import Overwrite, output_paths, write_data, write_picture
-from .parsing import axis, bound, low_pass, pair
+from .outputs import Failure, Overwrite, output_paths, write_data, write_picture
+from .parsing import axis, bound, by_name, low_pass, pairs
 from .structure_options import StructureOptions
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Calibrate:
     """Parameters from a recording, with uncertainties. Writes OUT.nc and OUT.png."""
 
     recording: tyro.conf.Positional[Path]
-    """file of the recording: .csv, .npy, .npz, .wav or .mat"""
+    """file of the recording: .csv, .txt, .npy, .npz, .wav or .mat"""
     free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME …")]
     """parameters to find, such as `mu c1 k1` or `mu,c1,k1`; all others are taken from the scene"""
     regime: Literal["sliding", "kick", "limit cycle"] = "kick"
@@ -113,8 +113,8 @@ class Calibrate:
     def run(self) -> None:
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
         free = [name for text in self.free for name in text.split(",") if name]
-        columns = dict(pair(text, "--column") for text in self.column)
-        units = dict(pair(text, "--unit") for text in self.unit)
+        columns, units = (pairs(option, texts) for option, texts in (("--column", self.column), ("--unit", self.unit)))
+        bounds, scene = by_name("--bound", map(bound, self.bound)), self.scene.scene()
         try:
             recording = fj.read_recording(
                 self.recording,
@@ -129,21 +129,29 @@ class Calibrate:
                 filter=None if self.filter is None else low_pass(self.filter),
                 y0=self.y0,
             )
+            fit = fj.calibrate(scene, recording, free, bounds, starts=self.starts)
         except ValueError as error:
             raise ValueError(with_options(str(error))) from None
-        bounds = dict(map(bound, self.bound))
-        fit = fj.calibrate(self.scene.scene(), recording, free, bounds, starts=self.starts)
         write_data(fit, data)
         write_picture(fj.show(fit), picture)
         print(fit)
+        if not fit.converged:
+            raise Failure("The calibration has found no values; why is said above.")
 
 
 def with_options(sentence: str) -> str:
-    """A sentence of `read_recording` with its arguments replaced by the options that set them: `columns` by `--column`."""
-    names = "columns|units|time|rate|full_scale|filter|y0|offset"
+    """A sentence of `read_recording` or `calibrate` with their arguments replaced by the options that set them: `columns` by
+    `--column`.
+    """
+    # No option sets how long `calibrate`'s blocks are.
+    sentence = sentence.replace("Raise `rate`, or record", "Record").replace(
+        "with `scene.replace`", "with another scene"
+    )
+    one_of = {"columns": "column", "units": "unit", "bounds": "bound"}
+    names = "columns|units|time|rate|full_scale|filter|y0|offset|free|starts|bounds"
     sentence = re.sub(
-        rf"\b(with|give|Argument) `({names})`",
-        lambda found: f"{found[1]} `--{found[2].removesuffix('s').replace('_', '-')}`",
+        rf"\b(with|give|Argument|Widen|Leave out) `({names})`",
+        lambda found: f"{found[1]} `--{one_of.get(found[2], found[2]).replace('_', '-')}`",
         sentence,
     )
     return sentence.replace("Argument `--", "Option `--")

@@ -18,7 +18,7 @@ from .compiled_code import keep_compiled_code
 from .cycle_commands import Branch, CycleCommand
 from .map_command import Map
 from .outputs import Failure, Interrupted
-from .parsing import options
+from .parsing import options, refuse_repeated
 from .simulate_command import Simulate
 from .study_commands import Reproduce, Tradeoff
 
@@ -45,6 +45,11 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
     if arguments == ["--version"]:
         print(f"fivjax {fj.__version__}")
         return 0
+    try:
+        refuse_repeated(arguments)
+    except ValueError as error:
+        print(f"fivjax: {error}", file=sys.stderr)
+        return 2
     with options():
         command = tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

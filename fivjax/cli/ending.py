@@ -8,6 +8,7 @@ thread is told of signals, too, and ends a process that has not ended by itself 
 imported there is nothing to keep, and an exception may get lost: the process ends at once.
 """
 
+import io
 import os
 import signal
 import socket
@@ -27,6 +28,10 @@ def program() -> NoReturn:
     """`main`, and the end of the process at once: Python would take half a second to take apart what JAX has made."""
     handled(_at_once)
     _end_when_late()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # What a terminal has no letters for is no reason to fail.
+            stream.reconfigure(errors="replace")
     from .command_line import main
 
     code = main(interrupt=_interrupt)

@@ -1,12 +1,16 @@
 """Parsing of options of the form `NAME=…`; each error shows the right form."""
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import tyro
 
 from ..foundation.digits import apart, counted
+
+T = TypeVar("T")
 
 
 def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
@@ -87,12 +91,45 @@ def options() -> tyro.constructors.ConstructorRegistry:
     return registry
 
 
-def pair(text: str, option: str) -> tuple[str, str]:
-    """The two sides of `COLUMN=…`."""
-    name, equals, meaning = text.partition("=")
-    if not (name and equals and meaning):
-        raise ValueError(f"Option `{option}` must read COLUMN=…, such as `t=ms`, but reads {text!r}.")
-    return name, meaning
+def pairs(option: str, texts: Iterable[str], form: str = "COLUMN=…, such as `t=ms`") -> dict[str, str]:
+    """The two sides of each text, such as `COLUMN=…`.
+
+    **Raises:** `ValueError` for a text of another form, and for a name that comes twice.
+    """
+
+    def sides(text: str) -> tuple[str, str]:
+        name, equals, meaning = text.partition("=")
+        if not (name and equals and meaning):
+            raise ValueError(f"Option `{option}` must read {form}, but reads {text!r}.")
+        return name, meaning
+
+    return by_name(option, map(sides, texts))
+
+
+def by_name(option: str, named: Iterable[tuple[str, T]]) -> dict[str, T]:
+    """What an option gives each name.
+
+    **Raises:** `ValueError` for a name that comes twice.
+    """
+    found: dict[str, T] = {}
+    for name, own in named:
+        if name in found:
+            raise ValueError(f"Option `{option}` must give each name once, but gives `{name}` twice.")
+        found[name] = own
+    return found
+
+
+def refuse_repeated(arguments: Iterable[str]) -> None:
+    """Refuse an option that is given twice: only the last of them would count.
+
+    **Raises:** `ValueError` for it.
+    """
+    given = [text.partition("=")[0].replace("_", "-") for text in arguments if text.startswith("--")]
+    for option in given:
+        if given.count(option) > 1:
+            raise ValueError(
+                f"Option `{option}` is there twice. Give it once, with all of its values one after the other."
+            )
 
 
 def bound(text: str) -> tuple[str, tuple[float, float]]:

@@ -10,6 +10,7 @@ import tyro
 import fivjax as fj
 
 from .options import SceneOptions
+from .parsing import pairs
 
 if TYPE_CHECKING:
     from ..model.scene import Scene
@@ -21,8 +22,8 @@ class StructureOptions(SceneOptions):
     """The scene; the defaults are the paper's. With --structure, a finite-element model in place of the oscillator."""
 
     structure: Path | None = None
-    """file of a finite-element code with the stiffness (and perhaps mass and damping); formats: see `fj.read_structure`. All
-    options below belong to it"""
+    """file of a finite-element code with the stiffness (and perhaps mass and damping); formats: see `fj.read_structure`. The
+    options from --units to --keep belong to it"""
     units: str | None = None
     """units of its files, such as SI or mm-t-s; they do not say"""
     mass: Path | None = None
@@ -92,7 +93,7 @@ class StructureOptions(SceneOptions):
                 units=self.units,
                 mass=self.mass,
                 damping=self.damping,
-                names=dict(_named(text) for text in self.matrices),
+                names=pairs("--matrices", self.matrices, "ROLE=NAME, such as `stiffness=KAAX`"),
                 labels=self.labels,
                 contacts=contacts,
                 load=load,
@@ -154,10 +155,3 @@ def _coordinate(text: str, option: str) -> tuple[int, int | str]:
     if node.isdecimal() and (direction in ("x", "y", "z") or direction.isdecimal()):
         return int(node), int(direction) if direction.isdecimal() else direction
     raise ValueError(f"Option `{option}` must be NODE:DIRECTION, such as `5:x` or `5:1`, but is {text!r}.")
-
-
-def _named(text: str) -> tuple[str, str]:
-    role, equals, name = text.partition("=")
-    if not (role and equals and name):
-        raise ValueError(f"Option `--matrices` must be ROLE=NAME, such as `stiffness=KAAX`, but is {text!r}.")
-    return role, name

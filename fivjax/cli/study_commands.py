@@ -68,9 +68,12 @@ class Reproduce:
     overwrite: Overwrite = False
 
     def run(self) -> None:
+        from ..paper.report import file_name, names_of
+
         report = self.out / "reproduce.md"
         if not self.overwrite:
-            refuse_existing(report)
+            each = map(file_name, names_of(self.figure))
+            refuse_existing(report, *(self.out / f"{name}{ending}" for name in each for ending in (".png", ".nc")))
         begin = time.perf_counter()
         try:
             made = fj.reproduce(self.figure, self.out)

@@ -81,9 +81,10 @@ def _reader(path: Path) -> Callable[[Path], Mapping[str, FileMatrix | str]]:
         ".npz": array_files.numpy_archive,
     }
     if path.suffix.lower() not in readers:
+        ending = repr(path.suffix) if path.suffix else "none of them"
         raise ValueError(
             f"File `{path}` must be one of {', '.join(readers)}, or hold a Matrix Market or Harwell-Boeing matrix, but ends in "
-            f"{path.suffix or 'nothing'!r} and begins like neither. Save the matrices as one of these; `.npz` is the simplest."
+            f"{ending} and begins like neither. Save the matrices as one of these; `.npz` is the simplest."
         )
     return readers[path.suffix.lower()]
 

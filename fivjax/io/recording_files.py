@@ -3,6 +3,7 @@
 import io
 import math
 import re
+import unicodedata
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,18 +20,10 @@ from .recordings import Recording, channel
 # Columns of a table, and characters of a name.
 MOST_TRACKS, LONGEST_NAME = 10_000, 200
 UNITS = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
-    "acceleration": {
-        "m/s2": 1.0,
-        "m/s^2": 1.0,
-        "m/s²": 1.0,
-        "mm/s2": 1e-3,
-        "mm/s^2": 1e-3,
-        "mm/s²": 1e-3,
-        "g": 9.80665,
-    },
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6},
+    "acceleration": {"m/s2": 1.0, "m/s^2": 1.0, "mm/s2": 1e-3, "mm/s^2": 1e-3, "g": 9.80665},
     "velocity": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2},
-    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "cm": 1e-2},
+    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "μm": 1e-6, "cm": 1e-2},
 }
 
 
@@ -74,9 +67,8 @@ def read_recording(
     path = arguments.path("path", path)
     readers = {".csv": _csv, ".txt": _csv, ".npy": _numpy, ".npz": _numpy, ".wav": _wav, ".mat": _matlab}
     if path.suffix.lower() not in readers:
-        raise ValueError(
-            f"File `{path}` must be one of {', '.join(readers)}, but ends in {path.suffix or 'nothing'!r}."
-        )
+        ending = repr(path.suffix) if path.suffix else "none of them"
+        raise ValueError(f"File `{path}` must be one of {', '.join(readers)}, but ends in {ending}.")
     check_there(path)
     arguments.real_number("full_scale", full_scale, above=0)
     if rate is not None:
@@ -166,24 +158,29 @@ def _csv(path: Path):
     for number, line in rows:
         if (found := line.count(separator) + 1) != len(names):
             raise ValueError(f"File `{path}`, line {number}: {len(names)} numbers expected, {found} found.")
-    table = np.empty((len(rows), len(names)))
-    for row, (number, line) in enumerate(rows):
-        entries = line.split(separator)
-        for column, entry in enumerate(entries):
-            # A comma can only be a decimal comma where it is not the separator.
-            text = entry.strip().replace(",", ".") if separator != "," else entry.strip()
-            try:
-                # Python takes underscores between digits, too.
-                table[row, column] = float(text.replace("_", "no number"))
-            except ValueError:
-                raise ValueError(
-                    f"File `{path}`, line {number}, column `{names[column]}`: {entry.strip()[:60]!r} is no number."
-                ) from None
-            if not math.isfinite(table[row, column]):
-                raise ValueError(
-                    f"File `{path}`, line {number}, column `{names[column]}`: must be finite, but is {entry.strip()[:60]}."
-                )
+    # A comma can only be a decimal comma where it is not the separator.
+    rows = [(n, (line if separator == "," else line.replace(",", ".")).replace('"', "")) for n, line in rows]
+    try:
+        table = np.loadtxt([line for _, line in rows], delimiter=separator, comments=None, ndmin=2)
+    except ValueError:
+        table = np.full(1, np.nan)
+    if not np.all(np.isfinite(table)):
+        table = np.array([_numbers(path, number, names, line.split(separator)) for number, line in rows])
     return dict(zip(names, table.T, strict=True)), units, None
+
+
+def _numbers(path: Path, line: int, names: list[str], entries: list[str]) -> list[float]:
+    """The numbers of a line, one by one: the first that is none is named."""
+    found = []
+    for name, entry in zip(names, map(str.strip, entries), strict=True):
+        try:
+            # Python takes underscores between digits, too.
+            found.append(float(entry.replace("_", "no number")))
+        except ValueError:
+            raise ValueError(f"File `{path}`, line {line}, column `{name}`: {entry[:60]!r} is no number.") from None
+        if not math.isfinite(found[-1]):
+            raise ValueError(f"File `{path}`, line {line}, column `{name}`: must be finite, but is {entry[:60]}.")
+    return found
 
 
 def _numpy(path: Path):
@@ -252,11 +249,13 @@ def _unit(path: Path, name: str, quantity: str, units: Mapping[str, str]) -> flo
     unit = units.get(name)
     if unit is None:
         return 1.0
-    if not isinstance(unit, str) or unit.strip() not in UNITS[quantity]:
+    # There are two letters µ that look the same, and digits that are raised: ² is 2.
+    plain = unicodedata.normalize("NFKC", unit).strip() if isinstance(unit, str) else None
+    if plain not in UNITS[quantity]:
         raise ValueError(
             f"File `{path}`, variable `{name}`: {unit!r} is no unit of {quantity}; known are {', '.join(UNITS[quantity])}."
         )
-    return UNITS[quantity][unit.strip()]
+    return UNITS[quantity][plain]
 
 
 def _must_have(path: Path, found: Mapping, name: str) -> None:

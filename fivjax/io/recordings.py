@@ -248,9 +248,13 @@ def _noise(noise, channels: tuple[Channel, ...]) -> Float[np.ndarray, " k"]:
     for name, value in noise.items():
         arguments.real_number(f"noise[{name!r}]", value, above=0)
     by_channel = {channel(name): float(value) for name, value in noise.items()}
+    if len(by_channel) < len(noise):
+        raise ValueError(f"Argument `noise` must name each channel once, but names {', '.join(map(str, noise))}.")
     missing = [str(one) for one in channels if one not in by_channel]
     if missing:
         raise ValueError(f"Argument `noise` must name every channel, but {missing[0]} is missing.")
+    if other := [str(one) for one in by_channel if one not in channels]:
+        raise ValueError(f"Argument `noise` names {other[0]}, which was not recorded.")
     return np.array([by_channel[one] for one in channels])
 
 

@@ -218,8 +218,12 @@ def _labels(labels) -> tuple[Label, ...] | None:
         return None
     if isinstance(labels, str | Path):
         check_there(Path(labels))
+        lines = [line.partition("#")[0] for line in Path(labels).read_text().splitlines()]
+        if not any(map(str.strip, lines)):
+            raise ValueError(f"File `{labels}` must hold two whole numbers a line, node and direction, but is empty.")
         try:
-            labels = np.loadtxt(labels, dtype=np.int64, delimiter="," if "," in Path(labels).read_text() else None)
+            delimiter = "," if any("," in line for line in lines) else None
+            labels = np.loadtxt(lines, dtype=np.int64, delimiter=delimiter, ndmin=2)
         except ValueError as error:
             raise ValueError(
                 f"File `{labels}` must hold two whole numbers a line, node and direction: {error}"

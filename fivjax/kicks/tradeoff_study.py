@@ -1,6 +1,7 @@
 """The cost of accuracy: methods, steps and precisions measured on the user's scene."""
 
 import dataclasses
+import functools
 import itertools
 import json
 import time
@@ -14,7 +15,6 @@ import xarray as xr
 
 from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
-from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import following, stage, tick
 from ..io.datasets import labelled
@@ -23,9 +23,9 @@ from ..maps.bistability import bistability_map
 from ..model.friction import Coulomb, ExponentialDecay
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_painleve
-from ..simulation.energy import EnergyData
 from ..simulation.rows import states_at
 from ..simulation.start import start_state
+from ..simulation.trajectory import Trajectory, simulate
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
@@ -77,8 +77,9 @@ def tradeoff(
       times the scene's) and p (1 to 4), with `8 * 2**refine + 1` points each: what `bistability_map(..., refine=)` saves.
 
     **Returns:** a dataset over `stepper` and `precision`: `cost` (s per trajectory-cycle: one trajectory over one period of the
-    least stable sliding mode, on this machine, without compilation), `state_error` (of the worst coordinate, relative to
-    the largest displacement or velocity), `p_crit_error` (NaN if by this method no kick within 0.05 of the critical one leads
+    least stable sliding mode, on this machine, without compilation, as `jax.vmap` of `simulate` takes it: `EventExact` in
+    double precision by kernels, if there are some for the scene), `state_error` (of the worst coordinate, relative to the
+    largest displacement or velocity), `p_crit_error` (NaN if by this method no kick within 0.05 of the critical one leads
     to vibration, or none does not), `wrong_verdicts` and `undecided` (shares of the kicks). The reference
     is `EventExact(order=20)` at a tenth of the tolerance. `part_cost` over `part` is the cost of parts of the work, relative to
     that of the event-exact end state alone. With `refine`, over `halvings`: `refined_seconds`, `refined_computed` (the share of
@@ -106,20 +107,21 @@ def tradeoff(
     with following("tradeoff", shown=progress, total=len(rows), unit=" methods"):
         exact = EventExact(order=20, tolerance=1e-16)
         stage("reference")
-        reference = _end_state(scene, exact, t1)
+        reference = np.asarray(_end_state(scene, exact, t1))
         edge = _boundary(scene, exact, p, t1) if boundary else None
         for (name, kind), method in rows.items():
             stage(f"{name}, {kind}")
             place = list(methods).index(name), precisions.index(kind)
-            own = scene if kind == "float64" else _single(scene)
-            measured["state_error"][place] = _state_error(_end_state(own, method, t1), reference, scene.structure.size)
-            measured["cost"][place] = _cost(own, method, t1, trajectories) / (trajectories * t1 * frequency)
+            end = functools.partial(_end_state, method=method, t1=t1, precision=kind)
+            state = np.asarray(jax.jit(end)(scene), np.float64)
+            measured["state_error"][place] = _state_error(state, reference, scene.structure.size)
+            measured["cost"][place] = _cost(scene, end, trajectories) / (trajectories * t1 * frequency)
             if edge is not None and kind == "float64":
                 for measure, value in edge(method).items():
                     measured[measure][place] = value
             tick()
         stage("parts")
-        parts = _parts(scene, t1)
+        parts = _parts(scene, t1, trajectories)
         refined = refinement_trade(scene, refine) if refine else {}
     halvings = {"halvings": np.arange(refine + 1)} if refine else {}
     dataset = xr.Dataset(
@@ -216,24 +218,20 @@ def _frequency(scene: Scene) -> float:
     return float(vibrating[np.argmax(vibrating.real)].imag / (2 * np.pi)) if len(vibrating) else 1.0
 
 
-def _single(scene: Scene) -> Scene:
-    return jax.tree.map(lambda leaf: leaf.astype(np.float32), scene)
+def _single(tree):
+    return jax.tree.map(lambda leaf: leaf.astype(np.float32), tree)
 
 
-def _run(
-    scene: Scene, method: AbstractStepper, t1: float, p=None, rows: int = 1, energy_data: EnergyData | None = None
-):
-    """States at the ends of `rows` equal intervals; all in the precision of the scene."""
-    dtype = scene.belt_speed.dtype
-    if p is not None:
-        scene = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.replace(p=p))
-    y0 = start_state(scene, None).astype(dtype)
-    most = MOST_ADVANCES + int(np.ceil(t1 / rows / method.dt))
-    return states_at(scene, method, y0, jnp.linspace(0, t1, rows + 1, dtype=dtype), most, energy_data)
-
-
-def _end_state(scene: Scene, method: AbstractStepper, t1: float) -> np.ndarray:
-    return np.asarray(compiled(lambda scene: _run(scene, method, t1)[0][-1])(scene), np.float64)
+def _end_state(scene: Scene, method: AbstractStepper, t1: float, precision: str = "float64"):
+    """As `simulate` computes it, in double precision; in single precision by its steps, for a traced scene: of a known one
+    mechanics would be computed in double precision.
+    """
+    if precision == "float64":
+        run = simulate(scene, t1, t1, method, derivatives="none", progress=False)
+        return jnp.concatenate([run.displacement[-1], run.velocity[-1]])
+    scene = _single(scene)
+    y0, instants = _single((start_state(scene, None), jnp.array([0.0, t1])))
+    return states_at(scene, method, y0, instants, MOST_ADVANCES + int(np.ceil(t1 / method.dt)))[0][-1]
 
 
 def _state_error(state: np.ndarray, reference: np.ndarray, n: int) -> float:
@@ -243,19 +241,16 @@ def _state_error(state: np.ndarray, reference: np.ndarray, n: int) -> float:
     return float(error) if np.isfinite(error) else np.inf
 
 
-def _cost(scene: Scene, method: AbstractStepper, t1: float, trajectories: int) -> float:
-    """Wall time (s) of `trajectories` trajectories that differ a little in their kick, or are copies if there is no kick."""
-    if isinstance(scene.load, Pulse):
-        each = np.asarray(scene.load.p) * np.linspace(0.99, 1.01, trajectories)
-    else:
-        each = np.ones(trajectories)
+def _cost(scene: Scene, result: Callable[[Scene], jax.Array | Trajectory], trajectories: int) -> float:
+    """Wall time (s) for the results of scenes that differ a little in their kick, or are copies if there is no kick, in one
+    batch.
+    """
+    kicked = isinstance(scene.load, Pulse)
+    each = np.asarray(scene.load.p) * np.linspace(0.99, 1.01, trajectories) if kicked else np.ones(trajectories)
 
     def one(scene, own):
-        if isinstance(scene.load, Pulse):
-            return _run(scene, method, t1, own)[0][-1]
-        return _run(jax.tree.map(lambda leaf: leaf * own.astype(leaf.dtype), scene), method, t1)[0][-1]
+        return result(scene.replace(p=own) if kicked else jax.tree.map(lambda leaf: leaf * own, scene))
 
-    # The scene is an argument: of a known one mechanics would be computed in double precision.
     run = jax.jit(jax.vmap(one, (None, 0)))
     return _timed(lambda: run(scene, each))
 
@@ -310,19 +305,18 @@ def _verdicts(scene: Scene, **options):
     return found
 
 
-def _parts(scene: Scene, t1: float) -> dict[str, float]:
+def _parts(scene: Scene, t1: float, trajectories: int) -> dict[str, float]:
     """The cost of parts of the work with the event-exact method, relative to that of the end state alone."""
-    method = EventExact()
 
-    def cost(scene: Scene, rows: int = 1, ledger: bool = False) -> float:
-        run = jax.jit(
-            lambda scene: _run(scene, method, t1, rows=rows, energy_data=EnergyData(scene) if ledger else None)
-        )
-        return _timed(lambda: run(scene))
+    def cost(scene: Scene, rows: int = 1, energy: bool = False) -> float:
+        def run(scene: Scene) -> Trajectory:
+            return simulate(scene, t1, t1 / rows, energy=energy, derivatives="none", progress=False)
+
+        return _cost(scene, run, trajectories)
 
     plain = cost(scene)
     found = {"end state alone": 1.0, "stored output, 1000 rows": cost(scene, rows=1000) / plain}
-    found["energy ledger"] = cost(scene, ledger=True) / plain
+    found["energy ledger"] = cost(scene, energy=True) / plain
     if isinstance(scene.friction, Coulomb):
         # Practically constant, so that the motion is the same but is computed as with friction that varies.
         mu = scene.friction.mu

@@ -111,6 +111,8 @@ def _refuse_more_axes(dataset: "xr.Dataset") -> None:
 
 def _of_trajectory(run: Trajectory, of_phase_plane: float = 0.25, figure: Figure | None = None, **options) -> Figure:
     """Its response, and the last share of it in the phase plane."""
+    if len(run.t) < 2:
+        raise ValueError(f"A picture of a run needs at least two rows, but it has {len(run.t)}. Show more of it.")
     if len(run.scene.structure.contacts) > 1:
         return plot.response(run, **options, figure=figure)
     figure = Figure(figsize=(10.0, 3.4), layout="constrained") if figure is None else figure

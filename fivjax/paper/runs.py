@@ -1,8 +1,8 @@
 """The paper's transients, each computed only once for all figures, and the data that figures keep of them."""
 
 import dataclasses
-import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -15,18 +15,24 @@ from .scenes import CASES
 class Runs:
     """The paper's transients, each computed only once."""
 
-    @functools.cache  # noqa: B019 (lives as long as one reproduction)
+    def __init__(self):
+        self._computed: dict[tuple[str, str], Any] = {}
+
+    def _once(self, what: str, name: str, compute: Callable[[], Any]) -> Any:
+        # `functools.cache` would keep what it is called for, and all runs, as long as the process lives.
+        if (what, name) not in self._computed:
+            self._computed[what, name] = compute()
+        return self._computed[what, name]
+
     def __call__(self, name: str) -> fj.Trajectory:
-        return CASES[name].run()
+        return self._once("run", name, CASES[name].run)
 
-    @functools.cache  # noqa: B019
-    def beginning(self, name: str, t1: float = 4.0) -> fj.Trajectory:
-        """The first part of a run, with as many rows: for windows that show details shorter than a row of the whole run."""
-        return dataclasses.replace(CASES[name], t1=t1).run()
+    def beginning(self, name: str) -> fj.Trajectory:
+        """The first 4 s of a run, with as many rows: for windows that show details shorter than a row of the whole run."""
+        return self._once("beginning", name, dataclasses.replace(CASES[name], t1=4.0).run)
 
-    @functools.cache  # noqa: B019
     def cycles(self, name: str) -> xr.Dataset:
-        return fj.energy_per_cycle(self(name))
+        return self._once("cycles", name, lambda: fj.energy_per_cycle(self(name)))
 
     def first(self, name: str, status: int | None = None) -> float:
         """The time (s) at which a run first sticks (0) or detaches (2), or, without `status`, of its first contact event;

@@ -149,7 +149,7 @@ def perturbation(run: Trajectory, *, zoom: float | None = None, figure: Figure |
         lower.set(xlabel="time (s)", xlim=window)
     # The axis covers the range of the load, not zero, so that a kick of a tenth is visible.
     low, high = float(np.min(run.load)), float(np.max(run.load))
-    room = 0.2 * (high - low) or 0.1 * high
+    room = 0.2 * (high - low) or 0.1 * high or 1.0
     panels[0, 0].set(ylabel="load (N)", ylim=(low - room, high + room))
     panels[1, 0].set_ylabel(with_unit(f"{what},\nacceleration", "m/s2"))
     if zoom is not None:

@@ -205,6 +205,21 @@ def test_limit_cycle_with_sticking_and_detachment():
 
 
 @pytest.mark.slow
+def test_a_cycle_is_fitted_whichever_channel_comes_first():
+    """The normal acceleration of a contact that never opens is noise, whose fundamental has no phase."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.1, 0.5), 0.5, fj.Pulse(100.0, 1.2))
+    run, rng = fj.simulate(scene, 8.0, 1 / 2000), np.random.default_rng(0)
+    moving, still = run.acceleration[-2000:, 0] + 0.1 * rng.normal(size=2000), 0.1 * rng.normal(size=2000)
+    fits = []
+    for signals in ({"a0": moving, "a2": still}, {"a2": still, "a0": moving}):
+        data = fj.Recording(2000.0, signals, "limit cycle")
+        fits.append(fj.calibrate(scene, data, ["mu_static"], starts=2, progress=False))
+        assert fits[-1].converged
+        assert fits[-1].values["mu_static"] == pytest.approx(0.2, abs=4 * fits[-1].uncertainty["mu_static"])
+    assert fits[0].values["mu_static"] == pytest.approx(fits[1].values["mu_static"], abs=1e-9)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "beats"), [(1.0, False), (2.0, True)])
 def test_the_papers_limit_cycle_beats_above_a_speed(speed, beats):
     scene = paper(mu=0.3, belt_speed=speed)

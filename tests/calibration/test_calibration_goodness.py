@@ -29,7 +29,7 @@ def test_a_model_that_fits_has_a_misfit_of_one_and_says_what_is_told_together(gr
     assert fit.misfit == pytest.approx(1, abs=0.15)
     assert max(scores(fit, scene).values()) < 4
     assert fit.combinations[0][0] == ("mu", "c1", "k1")
-    assert "mu, c1, k1: identifiable only in combination (correlation -" in str(fit)
+    assert "mu, c1, k1: known, but their errors go together (correlation -" in str(fit)
 
 
 @pytest.mark.parametrize("wrong", [{"k2": 1.001}, {"theta": 0.98}], ids=["spring", "angle"])

@@ -48,6 +48,17 @@ def test_a_second_of_samples_shows_one_period_whatever_the_rate(rate):
     assert np.sqrt(np.mean(left[clear] ** 2)) < 1.5
 
 
+def test_channels_that_are_still_change_no_frequency():
+    """Noise of the size of a vibration, and by itself: beside one that repeats it was taken for a beat."""
+    rng, rate = np.random.default_rng(3), 2000.0
+    t = np.arange(2000) / rate
+    moving = saw(FREQUENCY * t)[:, None] + 0.02 * rng.normal(size=(len(t), 1))
+    alone = folded(moving, rate, 40.0, 110.0)
+    beside = folded(np.concatenate([moving, rng.normal(size=(len(t), 3))], axis=1), rate, 40.0, 110.0)
+    assert beside.frequency == pytest.approx(alone.frequency, abs=1e-3)
+    assert alone.sidebands < BEATS and beside.sidebands < BEATS
+
+
 def test_a_vibration_that_beats_is_told_from_one_that_repeats():
     """Two sidebands of half the depth each; what beats is not any one cycle. At a low rate, too."""
     rng = np.random.default_rng(1)
@@ -111,6 +122,15 @@ def test_left_overs_are_compared_with_a_stated_noise():
     assert residual_tests(1.25 * 1111, 1111, [], stated=True).larger
     assert not residual_tests(1.25 * 1111, 1111, [], stated=False).larger
     assert residual_tests(0.5 * 1111, 1111, [], stated=False).smaller
+
+
+def test_what_is_left_far_below_a_stated_noise_is_no_error_of_the_model():
+    """One channel of two, stated a hundred times too noisy: its rounding is alike from block to block."""
+    rng = np.random.default_rng(1)
+    white, smooth = rng.normal(size=500), 0.01 * np.sin(0.1 * np.arange(500))
+    found = residual_tests(float(np.sum(white**2)), 1000, [[white, smooth]], stated=True)
+    assert not found.correlated
+    assert residual_tests(500.0, 1000, [[white, 100 * smooth]], stated=True).correlated
 
 
 def test_a_recording_that_holds_more_than_noise():

@@ -111,6 +111,9 @@ def test_friction_options():
         ("It has no column `t` or `time`; name it with `time`, or give `rate` in Hz.",
          "It has no column `t` or `time`; name it with `--time`, or give `--rate` in Hz."),
         ("Argument `rate` must be positive, but is 0.", "Option `--rate` must be positive, but is 0."),
+        ("Recording 0 is too short. Raise `rate`, or record for longer.", "Recording 0 is too short. Record for longer."),
+        ("`rate` is 50 Hz. Leave out `rate`.", "`rate` is 50 Hz. Leave out `--rate`."),
+        ("Argument `starts` must be 1. Widen `bounds`.", "Option `--starts` must be 1. Widen `--bound`."),
     ],
 )  # fmt: skip
 def test_a_remedy_names_the_option(sentence, expected):

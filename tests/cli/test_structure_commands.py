@@ -121,7 +121,7 @@ REFUSED = {
     ),
     "damping below zero": (["cea", *MODEL, "--damping-ratio", "-1"], "Option `--damping-ratio` must be non-negative"),
     "a role that is none": (["cea", *MODEL, "--matrices", "spring=K"], "Option `--matrices` must name stiffness"),
-    "half a role": (["cea", *MODEL, "--matrices", "stiffness"], "Option `--matrices` must be ROLE=NAME"),
+    "half a role": (["cea", *MODEL, "--matrices", "stiffness"], "Option `--matrices` must read ROLE=NAME"),
     "two models": (["cea", *MODEL, "--k1", "1e5", "--theta", "0.02"], "Option `--theta` belongs to the oscillator"),
     "a mass without a structure": (
         ["simulate", "--mass", "MASS.mtx"],

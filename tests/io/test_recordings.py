@@ -42,6 +42,16 @@ def test_csv_with_semicolons_and_decimal_commas(tmp_path):
     np.testing.assert_allclose(fj.read_recording(csv(tmp_path, "# from the rig\n" + text)).values[:, 0], A, atol=1e-9)
 
 
+def test_numbers_in_quotes_and_units_in_greek_or_raised(tmp_path):
+    """There are two letters that look like a micro, and a raised two."""
+    rows = [('"' + '","'.join(f"{x:.12g}" for x in row) + '"') for row in zip(1e6 * T, A, strict=True)]
+    for micro, two in (("\u03bc", "²"), ("\u00b5", "2"), ("u", "^2")):
+        text = "\n".join([f'"t ({micro}s)","a0 (mm/s{two})"', *rows])
+        found = fj.read_recording(csv(tmp_path, text))
+        np.testing.assert_allclose(found.t, T, atol=1e-12)
+        np.testing.assert_allclose(found.values[:, 0], 1e-3 * A, atol=1e-9)
+
+
 def test_the_sample_recording_is_read():
     """The file that README and notebook fit: 0.8 s at 2 kHz of two accelerations, units in its names."""
     found = fj.read_recording(Path(__file__).parents[2] / "notebooks" / "decay.csv", "kick")
@@ -60,6 +70,10 @@ def test_a_rate_that_contradicts_the_file_s_own_times_is_refused(tmp_path):
 def test_noise_by_channel_or_one_for_all():
     assert fj.Recording(T, {"a0": A, "v1": V}, noise=0.2).noise.tolist() == [0.2, 0.2]
     assert fj.Recording(T, {"a0": A, "v1": V}, noise={"v1": 0.1, "a0": 0.3}).noise.tolist() == [0.3, 0.1]
+    with pytest.raises(ValueError, match="names acceleration 5, which was not recorded"):
+        fj.Recording(T, {"a0": A}, noise={"a0": 0.1, "a5": 0.3})
+    with pytest.raises(ValueError, match="each channel once, but names a0, acceleration 0"):
+        fj.Recording(T, {"a0": A}, noise={"a0": 0.1, "acceleration 0": 0.3})
 
 
 def test_columns_by_name(tmp_path):

@@ -8,6 +8,8 @@ from scipy import sparse
 
 import fivjax as fj
 from fivjax.io import node_contacts
+from fivjax.io.file_matrix import Label
+from fivjax.io.structure_files import _labels
 from fivjax.linear import mode_search
 from fivjax.model import structure_checks
 
@@ -156,6 +158,18 @@ def test_each_format_gives_the_matrix_and_its_labels(folder, file, name, labels)
     found = fj.read_matrices(folder / file)[name]
     np.testing.assert_array_equal(found.matrix.toarray(), STIFFNESS)
     assert found.labels == labels
+
+
+def test_labels_of_a_file_with_comments(tmp_path):
+    """A comma in a comment separates no columns; and there may be one row."""
+    path = tmp_path / "labels.txt"
+    path.write_text("# node, direction\n17 1  # the pad, along the belt\n")
+    assert _labels(path) == (Label(17, 1),)
+    path.write_text("# node, direction\n17, 1\n18, 3\n")
+    assert _labels(path) == (Label(17, 1), Label(18, 3))
+    path.write_text("# node, direction\n\n")
+    with pytest.raises(ValueError, match="is empty"):
+        _labels(path)
 
 
 def test_a_structure_is_in_si_units_with_its_contacts_and_checks(folder):

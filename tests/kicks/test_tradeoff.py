@@ -1,5 +1,6 @@
 """The trade-off table: its errors are those that the oracle finds, and its recommendations follow from it."""
 
+import functools
 import json
 
 import jax
@@ -54,7 +55,10 @@ def test_costs_are_costs_and_parts_are_named(measured):
 def test_costs_in_single_precision():
     """Where mechanics were computed from a scene that is known, a run was half in double precision, and failed."""
     with jax.enable_x64(True):
-        assert tradeoff_study._cost(tradeoff_study._single(SCENE), fj.WhereSwitched(dt=1e-3), 0.01, 2) > 0
+        end = functools.partial(
+            tradeoff_study._end_state, method=fj.WhereSwitched(dt=1e-3), t1=0.01, precision="float32"
+        )
+        assert tradeoff_study._cost(SCENE, end, 2) > 0 and jax.jit(end)(SCENE).dtype == np.float32
 
 
 @pytest.mark.slow

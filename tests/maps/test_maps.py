@@ -416,6 +416,53 @@ def test_trajectories_that_a_load_of_ones_own_leaves_alike_share_their_attractor
     np.testing.assert_allclose(m["amplitude"], expected["amplitude"], rtol=1e-12)
 
 
+class Late(fj.AbstractLoad):
+    """A load that changes twice: after 2 s and at a time of its own."""
+
+    force: float
+    meanwhile: float
+    afterwards: float
+    last: float
+
+    @property
+    def jumps(self):
+        return jnp.stack([jnp.asarray(2.0), jnp.asarray(self.last)])
+
+    @property
+    def final(self):
+        return self.afterwards
+
+    def __call__(self, t):
+        return jnp.where(t < 2.0, self.force, jnp.where(t < self.last, self.meanwhile, self.afterwards))
+
+
+def two_blocks() -> fj.Structure:
+    """Two oscillators side by side on the belt, tied by a weak spring."""
+    stiffness = np.diag([1.0, 2.0, 1.1, 2.1])
+    stiffness[0, 2] = stiffness[2, 0] = -0.05
+    stiffness[[0, 1, 2, 3], [1, 0, 3, 2]] = 0.3
+    contacts = [fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)]
+    return fj.Structure(np.eye(4), 0.05 * stiffness, stiffness, [0.0, -1.0, 0.0, -1.2], contacts=contacts)
+
+
+def test_nothing_happens_before_a_load_begins_to_press_several_contacts():
+    """Rounding opened and closed two contacts that touch without a load, until these were too many events."""
+    scene = fj.Scene(two_blocks(), fj.Coulomb(0.3, 0.4), 0.3, Late(0.0, 4.0, 1.0, 4.0))
+    found = fj.bistability_map(scene, meanwhile=[0.9, 1.5, 4.0], progress=False)
+    hardly = fj.bistability_map(scene.replace(force=1e-9), meanwhile=[0.9, 1.5, 4.0], progress=False)
+    assert (found["verdict"] >= 0).all() and (found["verdict"] == hardly["verdict"]).all()
+    np.testing.assert_allclose(found["amplitude"], hardly["amplitude"], atol=1e-7)
+
+
+def test_a_verdict_comes_soon_after_the_last_jump_however_late_that_is():
+    """A round of steps grows with the time that a trajectory has taken: it went on for many times as long after the jump."""
+    scene = fj.Scene(two_blocks(), fj.Coulomb(0.1), 1.0, Late(1.0, 1.001, 1.0, 4.0))
+    last = [20.0, 2e2, 2e3]
+    found = fj.bistability_map(scene, last=last, progress=False)
+    assert (found["verdict"] == fj.Verdict.SLIDING).all()
+    assert ((found["decided_at"] > last) & (found["decided_at"] < np.add(last, 100.0))).all()
+
+
 def test_a_parameter_of_a_structure_may_have_a_name_of_the_kicks():
     """Taken for one of the kick, it would not change the structure."""
 

@@ -4,6 +4,8 @@ import dataclasses
 import re
 import subprocess
 import sys
+import types
+import weakref
 
 import numpy as np
 import pytest
@@ -174,6 +176,22 @@ def test_the_command_makes_one_figure(tmp_path, capsys):
     assert cli.main(["reproduce", "--figure", "2", "--out", str(tmp_path)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fig02.nc", "fig02.png", "reproduce.md"]
     assert "reproduce.md" in capsys.readouterr().out
+
+
+def test_a_picture_of_ones_own_is_not_replaced(tmp_path, capsys):
+    (tmp_path / "fig02.png").write_text("mine")
+    assert cli.main(["reproduce", "--figure", "2", "--out", str(tmp_path)]) == 2
+    assert "fig02.png` is there already" in capsys.readouterr().err
+    assert (tmp_path / "fig02.png").read_text() == "mine"
+
+
+def test_runs_are_gone_with_their_reproduction(monkeypatch):
+    monkeypatch.setattr(runs, "CASES", {"one": types.SimpleNamespace(run=object)})
+    own = runs.Runs()
+    assert own("one") is own("one")
+    gone = weakref.ref(own)
+    del own
+    assert gone() is None
 
 
 def test_spectra_of_a_known_signal():
