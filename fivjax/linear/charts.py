@@ -14,7 +14,7 @@ from ..io.datasets import check_axis_names, labelled
 from ..model.scene import Scene, steady_sliding
 from ..model.structure import Structure
 from .linearisation import sliding_motion, steady_matrices, time_scale
-from .polynomials import characteristic_polynomial, determinant, polynomial_roots
+from .polynomials import characteristic_polynomial
 from .routh_hurwitz import LARGEST_EXPANDED, hurwitz_determinants
 from .system import with_axes
 
@@ -28,9 +28,8 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
 
         c = fj.cea.chart(fj.belt_oscillator(), mu=np.linspace(0, 0.5, 1000), k1=np.linspace(80e3, 120e3, 1000))
 
-    The roots of the characteristic polynomial are found for all points together (`polynomial_roots`); `margin` is from
-    Routh–Hurwitz. Above 4 sliding coordinates, and with several contacts, the eigenvalues of the state matrix are computed
-    point by point, without `margin`.
+    Growth rates are from the eigenvalues of the state matrix, `margin` from Routh–Hurwitz; it is left out above 4 sliding
+    coordinates, and with several contacts.
 
     **Arguments:**
 
@@ -60,9 +59,8 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     columns = [values.ravel() for values in grid]
     points = columns[0].size
     expanded = _is_expanded(scene.structure)
-    # Points that are computed together, by polynomials and by eigenvalues: the latter need a matrix for each.
-    points_at_once, points_with_matrices = 8192, 64
-    batch = min(points_at_once if expanded else points_with_matrices, points)
+    # Points that are computed together: each needs a matrix.
+    batch = min(64, points)
     padding = -points % batch
     columns = [np.concatenate([c, np.repeat(c[-1:], padding)]).reshape(-1, batch) for c in columns]
     results = _chart(scene, tuple(axes), [real(c) for c in columns])
@@ -81,44 +79,30 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
         {name: (tuple(axes), v, {"long_name": long, "units": unit}) for name, (v, long, unit) in variables.items()},
         coords=axes,
     )
-    method = "characteristic polynomial, Routh-Hurwitz" if expanded else "eigenvalues"
+    method = "eigenvalues, Routh-Hurwitz" if expanded else "eigenvalues"
     return labelled(dataset, scene, analysis="stability chart", method=method)
 
 
 @kept
 def _chart(scene, names, columns):
-    def polynomial(*values):
-        point = scene.replace(**dict(zip(names, values, strict=True)))
-        _, normal_force = steady_sliding(point, point.load.final)
-        mass, damping, stiffness = steady_matrices(point, normal_force)
-        scale = time_scale(point.structure)
-        coefficients = characteristic_polynomial(mass, damping, stiffness, scale)
-        (against,), _ = determinant([[[entry] for entry in row] for row in mass])
-        # That determinant is of the sign of the contact's normal compliance, which is negative past Painlevé's limit.
-        ok = _slides(point, normal_force) & (against > 0)
-        smallest = jnp.min(jnp.stack(hurwitz_determinants(coefficients)))
-        return [jnp.where(ok, c, jnp.nan) for c in coefficients], scale, jnp.where(ok, smallest, jnp.nan), normal_force
-
-    def by_polynomial(chunk):
-        coefficients, scale, smallest, normal_force = jax.vmap(polynomial)(*chunk)
-        roots = polynomial_roots(coefficients)
-        fastest = jnp.argmax(roots.real, axis=0)
-        growth_rate = jnp.max(roots.real, axis=0) * scale
-        frequency = jnp.abs(jnp.take_along_axis(roots.imag, fastest[None], axis=0)[0]) * scale / (2 * jnp.pi)
-        return growth_rate, jnp.where(jnp.isnan(growth_rate), jnp.nan, frequency), smallest, normal_force
-
-    def by_eigenvalues(*values):
+    def at(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))
         matrix, forces = sliding_motion(point)
         ok = _slides(point, forces) & jnp.all(jnp.isfinite(matrix)) & slides_uniquely(Mechanics(point))
         roots = eigenvalues(jnp.where(ok, matrix, jnp.eye(matrix.shape[0])))
         fastest = jnp.argmax(roots.real)
-        results = roots.real[fastest], jnp.abs(roots.imag[fastest]) / (2 * jnp.pi), jnp.nan
+        margin = _margin(point) if _is_expanded(scene.structure) else jnp.nan
+        results = roots.real[fastest], jnp.abs(roots.imag[fastest]) / (2 * jnp.pi), margin
         return *(jnp.where(ok, r, jnp.nan) for r in results), jnp.min(forces)
 
-    if _is_expanded(scene.structure):
-        return jax.lax.map(by_polynomial, tuple(columns))
-    return jax.lax.map(lambda chunk: jax.vmap(by_eigenvalues)(*chunk), tuple(columns))
+    return jax.lax.map(lambda chunk: jax.vmap(at)(*chunk), tuple(columns))
+
+
+def _margin(scene: Scene):
+    """The smallest Hurwitz determinant of sliding."""
+    _, normal_force = steady_sliding(scene, scene.load.final)
+    coefficients = characteristic_polynomial(*steady_matrices(scene, normal_force), time_scale(scene.structure))
+    return jnp.min(jnp.stack(hurwitz_determinants(coefficients)))
 
 
 def _is_expanded(structure: Structure) -> bool:

@@ -544,19 +544,6 @@ def test_margin_is_smooth_through_the_coalescence():
             assert np.isclose(slope(mu), expected, rtol=1e-5)
 
 
-def test_roots_of_polynomials_in_a_batch():
-    rng = np.random.default_rng(0)
-    roots = rng.normal(size=(500, 3)) + 1j * rng.normal(size=(500, 3))
-    roots = np.concatenate([roots, roots.conj(), rng.normal(size=(500, 2))], axis=1)
-    with jax.enable_x64(True):
-        coefficients = [jax.numpy.asarray(c) for c in np.array([np.poly(r).real for r in roots]).T]
-        found = np.asarray(polynomials.polynomial_roots(coefficients)).T
-    # Some of 500 random sets have roots close together; each is then less well determined by its coefficients.
-    distance = np.abs(found[:, :, None] - roots[:, None, :])
-    assert distance.min(axis=1).max() < 1e-6
-    assert np.median(distance.min(axis=1)) < 1e-13
-
-
 def test_chart_of_a_structure():
     chart = cea.chart(belt(), mu=np.linspace(0.0, 0.5, 41), k1=np.linspace(80e3, 120e3, 37))
     assert chart["growth_rate"].dims == ("mu", "k1")
