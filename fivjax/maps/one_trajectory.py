@@ -108,17 +108,19 @@ def begin(scene: Scene, shared: GroupConstants, initial, *, energy: bool = False
     )
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(scene)]))
     mechanics, weights = shared.mechanics, scene.structure.weights
-    # Without a load nothing happens before its first jump; rounding would open and close several contacts that touch.
-    t = jnp.zeros((), y.dtype)
+    # At rest without a load nothing happens before its first jump; rounding would open and close several contacts that touch.
+    t, load = jnp.zeros((), y.dtype), scene.load.force
     if not initial.shape[0]:
-        t = jnp.where(load_from(scene.load, t) == 0, next_jump(scene.load, t), t)
+        idle = (load == 0) & (load_from(scene.load, t) == 0)
+        t = jnp.where(idle, next_jump(scene.load, t), t)
+        load = jnp.where(idle, load_from(scene.load, t), load)
     largest = jnp.max(jnp.abs(loads + scene.load.final)) / jnp.abs(scene.load.final)
     belt = jnp.max(weights[scene.structure.size + mechanics.tangential] * jnp.abs(scene.belt_speed))
     return Progress(
         t=t,
         skipped=jnp.zeros((), y.dtype),
         y=y,
-        contact=physics.status_from_forces(mechanics, load_from(scene.load, t) - scene.load.final, y),
+        contact=physics.status_from_forces(mechanics, load - scene.load.final, y),
         crossing=jnp.full_like(y, jnp.nan),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),

@@ -363,7 +363,6 @@ def test_the_highest_speed_of_a_motion_may_lie_in_a_flight_shorter_than_an_inter
     assert found.amplitude.item() == pytest.approx(seen, rel=1e-4) and seen > 1.2
 
 
-@pytest.mark.slow
 def test_a_gap_that_opens_further_and_closes_within_a_step_is_seen_to_close():
     """It is positive at both ends of the step, and rises at the first: a landing was missed, and the motion came to the other of
     two cycles. The kernel of whole trajectories follows it by series.
