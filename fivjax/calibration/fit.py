@@ -59,7 +59,7 @@ def calibrate(
       each contact: `mu_0`, `mu_1`, …
     - `bounds`: pairs by name. Unless given, a positive parameter is kept so (`theta` and `belt_speed` may have any value).
     - `starts`: the number of first guesses: the scene's own, and others within `spread` (relative) around it, drawn with
-      `seed`. For limit cycles there are at least 31, half of them with a sliding mode at the measured frequency.
+      `seed`. For limit cycles there are some 32 at least, half of them with a sliding mode at the measured frequency.
     - `rate`: recordings are averaged over so many blocks per second before they are compared; unless given, 16 per period of
       the scene's highest sliding mode. The model is sampled as the recording was, and averaged over the same blocks. Limit
       cycles are not: they are folded into one period.

@@ -29,15 +29,16 @@ def program() -> NoReturn:
     handled(_at_once)
     _end_when_late()
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            # What a terminal has no letters for is no reason to fail.
+        # What a terminal has no letters for is no reason to fail.
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")
     from .command_line import main
 
     code = main(interrupt=_interrupt)
     try:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:  # it was closed from the beginning
+                stream.flush()
     except OSError:  # nobody reads it any more; the code is Python's own for this
         code = code or 120
     os._exit(code)

@@ -125,10 +125,11 @@ def refuse_repeated(arguments: Iterable[str]) -> None:
     **Raises:** `ValueError` for it.
     """
     given = [text.partition("=")[0].replace("_", "-") for text in arguments if text.startswith("--")]
+    given = [option.replace("--no-", "--", 1) for option in given]
     for option in given:
         if given.count(option) > 1:
             raise ValueError(
-                f"Option `{option}` is there twice. Give it once, with all of its values one after the other."
+                f"Option `{option}` is there twice. Give it once; if it takes several values, write them one after the other."
             )
 
 

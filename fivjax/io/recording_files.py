@@ -159,14 +159,25 @@ def _csv(path: Path):
         if (found := line.count(separator) + 1) != len(names):
             raise ValueError(f"File `{path}`, line {number}: {len(names)} numbers expected, {found} found.")
     # A comma can only be a decimal comma where it is not the separator.
-    rows = [(n, (line if separator == "," else line.replace(",", ".")).replace('"', "")) for n, line in rows]
+    if separator != ",":
+        rows = [(number, line.replace(",", ".")) for number, line in rows]
+    rows = [
+        (number, separator.join(map(_unquoted, line.split(separator))) if '"' in line else line)
+        for number, line in rows
+    ]
     try:
         table = np.loadtxt([line for _, line in rows], delimiter=separator, comments=None, ndmin=2)
     except ValueError:
-        table = np.full(1, np.nan)
-    if not np.all(np.isfinite(table)):
+        table = np.zeros(0)
+    # It leaves out empty lines.
+    if len(table) != len(rows) or not np.all(np.isfinite(table)):
         table = np.array([_numbers(path, number, names, line.split(separator)) for number, line in rows])
     return dict(zip(names, table.T, strict=True)), units, None
+
+
+def _unquoted(entry: str) -> str:
+    entry = entry.strip()
+    return entry[1:-1] if len(entry) > 1 and entry[0] == entry[-1] == '"' else entry
 
 
 def _numbers(path: Path, line: int, names: list[str], entries: list[str]) -> list[float]:

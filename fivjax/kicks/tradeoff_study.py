@@ -86,8 +86,8 @@ def tradeoff(
     the points that were computed) and `refined_wrong` (that of points with a wrong verdict). The attribute
     `recommendation` names, for each accuracy of the state, the cheapest method that reaches it.
 
-    **Raises:** `TypeError` or `ValueError` for objects that are no methods, times and counts that are not positive, and a load
-    without a pulse if `boundary` is true.
+    **Raises:** `TypeError` or `ValueError` for objects that are no methods, times and counts that are not positive, a `t1`
+    shorter than a method's step, and a load without a pulse if `boundary` is true.
 
     **Example:**
 
@@ -198,6 +198,12 @@ def _check(scene, methods, t1, trajectories, boundary, refine) -> tuple[int, int
     for name, method in methods.items():
         arguments.instance(f"methods[{name!r}]", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
+    for name, method in methods.items():
+        if not method.chooses_its_steps and method.dt > t1:
+            raise ValueError(
+                f"Argument `t1` must be at least as long as each method's step, but is {t1:g} s, and that of {name!r} is "
+                f"{method.dt:g} s."
+            )
     trajectories = arguments.whole_number("trajectories", trajectories, minimum=1)
     refuse_painleve(scene)
     arguments.truth("boundary", boundary)

@@ -210,14 +210,9 @@ class _Following:
             self.own_from = 2 * self.done
 
     def advance(self) -> None:
-        """A round of steps. Trajectories that have taken long may take longer: rounds grow longer, in proportion. But as far as
-        the pace tells they end at the last jump of a load, after which there may be a verdict at once.
-        """
-        task, now = self.task, self.trajectories.tree[1]
-        left, steps = np.asarray(now.last_jump - now.t), self.done // 8
-        if np.any(waits := (left > 0) & (now.t > 0)):
-            steps = min(steps, int(np.min(left[waits] * (self.done / now.t[waits]))))
-        steps = min(max(task.method.round, steps), max(task.limits.max_steps - self.done, 1))
+        """A round of steps. Trajectories that have taken long may take longer: rounds grow longer, in proportion."""
+        task = self.task
+        steps = min(max(task.method.round, self.done // 8), max(task.limits.max_steps - self.done, 1))
         advance_all(self.batch, self.group[self.pending], self.trajectories, steps)
         self.done += steps
 

@@ -91,6 +91,7 @@ MU = ["--free", "mu"]
         (["good.csv", *MU, "--bound", "mu=0.1:0.3", "mu=0.1:0.4"], ["`--bound`", "`mu` twice"]),
         (["good.csv", *MU, "--column", "a0=a0", "a0=a1"], ["`--column`", "`a0` twice"]),
         (["good.csv", *MU, "--column", "X=a0", "--column", "Y=a1"], ["`--column`", "there twice", "one after the other"]),
+        (["good.csv", *MU, "--overwrite", "--no-overwrite"], ["`--overwrite`", "there twice"]),
         (["good.csv", *MU, "--full-scale=2", "--full_scale", "3"], ["`--full-scale`", "there twice"]),
         (["good.csv", "--free", "mu,mu"], ["twice"]),
         (["good.csv", *MU, "--bound", "mu"], ["NAME=LOW:HIGH", "'mu'"]),

@@ -127,6 +127,8 @@ BAD_FILES = [
     ("t,a0\n0,1\n0.1,x\n", ["line 3", "`a0`", "'x'"]),
     ("t,a0\n0,1\n0.1,2,3\n", ["line 3", "2 numbers expected, 3 found"]),
     ("t,a0\n0,1\n0.1,nan\n", ["line 3", "`a0`", "finite"]),
+    ('a0\n1\n""\n2\n', ["line 3", "`a0`", "''"]),
+    ('t,a0\n0,1\n0.1,1"2\n', ["line 3", "`a0`", '1"2']),
     ("0,1\n0.1,2\n", ["line 1", "names"]),
     ("t,t,a0\n0,1,2\n", ["line 1", "`t`", "twice"]),
     ("t,b\n0,1\n0.1,2\n", ["no channel", "t, b", "`columns`"]),

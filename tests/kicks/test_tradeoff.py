@@ -90,6 +90,10 @@ def test_bad_input_is_refused():
         fj.tradeoff(scene, trajectories=0, boundary=False)
     with pytest.raises(ValueError, match="`t1`"):
         fj.tradeoff(scene, t1=-1.0, boundary=False)
+    with pytest.raises(
+        ValueError, match=r"`t1` must be at least as long as each method's step, but is 0\.01 s, and that of 'x'"
+    ):
+        fj.tradeoff(scene, methods={"x": fj.WhereSwitched(dt=0.02)}, t1=0.01, boundary=False)
     with pytest.raises(ValueError, match="`precisions`"):
         fj.tradeoff(scene, precisions=("float16",), boundary=False)
 

@@ -453,15 +453,6 @@ def test_nothing_happens_before_a_load_begins_to_press_several_contacts():
     np.testing.assert_allclose(found["amplitude"], hardly["amplitude"], atol=1e-7)
 
 
-def test_a_verdict_comes_soon_after_the_last_jump_however_late_that_is():
-    """A round of steps grows with the time that a trajectory has taken: it went on for many times as long after the jump."""
-    scene = fj.Scene(two_blocks(), fj.Coulomb(0.1), 1.0, Late(1.0, 1.001, 1.0, 4.0))
-    last = [20.0, 2e2, 2e3]
-    found = fj.bistability_map(scene, last=last, progress=False)
-    assert (found["verdict"] == fj.Verdict.SLIDING).all()
-    assert ((found["decided_at"] > last) & (found["decided_at"] < np.add(last, 100.0))).all()
-
-
 def test_a_parameter_of_a_structure_may_have_a_name_of_the_kicks():
     """Taken for one of the kick, it would not change the structure."""
 
