@@ -51,10 +51,11 @@ def folded(
     # The residuals of harmonics alone find the frequency roughly, those of neighbours exactly.
     by_harmonics, by_neighbours = 3, 3
     t = (np.arange(len(samples)) - 0.5 * (len(samples) - 1)) / rate
-    size = samples.std(axis=0)
+    deviation = samples.std(axis=0)
+    size = np.where(deviation > 0, deviation, 1.0)
     # Where there is little but noise, a channel says little of the frequency and of beats.
-    vibrating = 1 - (estimated_noise(samples) / np.where(size > 0, size, 1.0)) ** 2
-    scaled = (samples - samples.mean(axis=0)) / np.where(size > 0, size, 1.0) * np.clip(vibrating, 1e-3, 1.0) ** 2
+    vibrating = np.clip(1 - (estimated_noise(samples) / size) ** 2, 1e-3, 1.0)
+    scaled = (samples - samples.mean(axis=0)) / size * vibrating**2
     frequency = _strongest(scaled, 1 / rate, lowest, highest)
     count = max(1, min(MOST_HARMONICS, len(samples) // 8))
     for k in range(by_harmonics + by_neighbours):

@@ -45,11 +45,6 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
     if arguments == ["--version"]:
         print(f"fivjax {fj.__version__}")
         return 0
-    try:
-        refuse_repeated(arguments)
-    except ValueError as error:
-        print(f"fivjax: {error}", file=sys.stderr)
-        return 2
     with options():
         command = tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
@@ -61,6 +56,7 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
     received: list[int] = []
     try:
         with _interruptible(received, interrupt or _interrupt), in_lines():
+            refuse_repeated(arguments)
             command.run()
     except BaseException as error:
         if isinstance(error, Interrupted | KeyboardInterrupt) or received:

@@ -195,10 +195,9 @@ def _check(scene, methods, t1, trajectories, boundary, refine) -> tuple[int, int
     arguments.known("scene", scene)
     if not isinstance(methods, dict) or not methods:
         raise TypeError("Argument `methods` must be a dict of steppers by name, such as {'exact': fj.EventExact()}.")
-    for name, method in methods.items():
-        arguments.instance(f"methods[{name!r}]", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
     for name, method in methods.items():
+        arguments.instance(f"methods[{name!r}]", method, AbstractStepper, "a stepper, such as EventExact()")
         if not method.chooses_its_steps and method.dt > t1:
             raise ValueError(
                 f"Argument `t1` must be at least as long as each method's step, but is {t1:g} s, and that of {name!r} is "

@@ -416,23 +416,22 @@ def test_trajectories_that_a_load_of_ones_own_leaves_alike_share_their_attractor
 
 
 class Late(fj.AbstractLoad):
-    """A load that changes twice: after 2 s and at a time of its own."""
+    """A load that changes after 2 s and after 4 s."""
 
     force: float
     meanwhile: float
     afterwards: float
-    last: float
 
     @property
     def jumps(self):
-        return jnp.stack([jnp.asarray(2.0), jnp.asarray(self.last)])
+        return jnp.array([2.0, 4.0])
 
     @property
     def final(self):
         return self.afterwards
 
     def __call__(self, t):
-        return jnp.where(t < 2.0, self.force, jnp.where(t < self.last, self.meanwhile, self.afterwards))
+        return jnp.where(t < 2.0, self.force, jnp.where(t < 4.0, self.meanwhile, self.afterwards))
 
 
 def two_blocks() -> fj.Structure:
@@ -446,7 +445,7 @@ def two_blocks() -> fj.Structure:
 
 def test_nothing_happens_before_a_load_begins_to_press_several_contacts():
     """Rounding opened and closed two contacts that touch without a load, until these were too many events."""
-    scene = fj.Scene(two_blocks(), fj.Coulomb(0.3, 0.4), 0.3, Late(0.0, 4.0, 1.0, 4.0))
+    scene = fj.Scene(two_blocks(), fj.Coulomb(0.3, 0.4), 0.3, Late(0.0, 4.0, 1.0))
     found = fj.bistability_map(scene, meanwhile=[0.9, 1.5, 4.0], progress=False)
     hardly = fj.bistability_map(scene.replace(force=1e-9), meanwhile=[0.9, 1.5, 4.0], progress=False)
     assert (found["verdict"] >= 0).all() and (found["verdict"] == hardly["verdict"]).all()
