@@ -4,7 +4,7 @@ import contextlib
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from types import FrameType
 
 import tyro
@@ -84,7 +84,7 @@ def _interrupt(*_) -> None:
 
 
 @contextlib.contextmanager
-def _interruptible(received: list[int], interrupt: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+def _interruptible(received: list[int], interrupt: Callable[[int, FrameType | None], None]) -> Generator[None]:
     """Note SIGINT and SIGTERM in `received` before they interrupt."""
 
     def note(number: int, frame: FrameType | None) -> None:

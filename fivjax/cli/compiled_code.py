@@ -22,7 +22,7 @@ def keep_compiled_code() -> None:
     """
     import jax
 
-    warnings.showwarning = _show
+    warnings.showwarning = _show  # pyrefly: ignore[bad-assignment]
     if jax.config.jax_compilation_cache_dir is not None:
         return
     home = folder_of_caches()

@@ -5,7 +5,7 @@ import multiprocessing
 import signal
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import ProcessPoolExecutor
 
 from ..foundation.kept_folder import NotKept
@@ -14,7 +14,7 @@ from .compiled_code import keep_compiled_code
 
 
 @contextlib.contextmanager
-def workers_of(count: int, dask: str | None) -> Iterator:
+def workers_of(count: int, dask: str | None) -> Generator:
     """An executor for `fivjax.bistability_map` (None: threads of this process) while the command runs.
 
     **Raises:** `ValueError` for counts below zero, both kinds at once, and a scheduler that does not answer.

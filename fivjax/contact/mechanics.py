@@ -55,7 +55,7 @@ class Mechanics(eqx.Module):
         structure, matrices = scene.structure, scene.structure.matrices
         n = structure.size
         refuse_vector_contacts(structure, "This")
-        self.places = structure.places
+        self.places = structure.places  # pyrefly: ignore[bad-assignment]
         columns = jnp.eye(n, dtype=matrices.mass.dtype)[
             :, np.array(self.places).T.ravel()
         ]  # tangential directions, then normal ones

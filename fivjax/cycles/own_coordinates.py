@@ -49,9 +49,8 @@ def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
         for name in own:
             given[name] = _inside(scene, given[name], name)
         # Anything else is refused by the function.
-        starts = given.get("starts")
-        if "starts" in names and arguments.is_listed(starts):
-            given["starts"] = [_inside(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
+        if {"starts"} & set(names) & given.keys() and arguments.is_listed(given["starts"]):
+            given["starts"] = [_inside(scene, one, f"starts[{number}]") for number, one in enumerate(given["starts"])]
         given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
         return _outside(scene, call(**given))
 
@@ -130,7 +129,7 @@ def _outside(scene: Scene, found) -> Any:
         return found.in_scene(scene, turned)
     # A cycle nearby has a state; what else there is has no coordinates.
     if isinstance(found, eqx.Module) and hasattr(found, "state"):
-        return dataclasses.replace(found, state=turned(found.state))
+        return dataclasses.replace(found, state=turned(found.state))  # pyrefly: ignore[unexpected-keyword]
     return found
 
 

@@ -38,7 +38,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     @functools.cache
     def alone():
         # `filter_jit` hands further arguments on to JAX, but its overloads do not say so.
-        return eqx.filter_jit(function, compiler_options=quick_compiler_options())  # pyright: ignore[reportCallIssue]
+        return eqx.filter_jit(function, compiler_options=quick_compiler_options())  # pyrefly: ignore[unexpected-keyword]
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

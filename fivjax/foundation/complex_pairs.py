@@ -17,7 +17,7 @@ class Pair(NamedTuple):
     real: Any
     imag: Any
 
-    def __getitem__(self, index) -> "Pair":  # pyright: ignore[reportIncompatibleMethodOverride]
+    def __getitem__(self, index) -> "Pair":
         return Pair(self.real[index], self.imag[index])
 
 

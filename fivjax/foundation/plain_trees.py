@@ -107,7 +107,7 @@ def _class_of(name: str) -> type:
 
 def _fields(value) -> dict[str, Any]:
     if isinstance(value, tuple):
-        return value._asdict()  # pyright: ignore[reportAttributeAccessIssue]
+        return value._asdict()
     # Fields that were not set have no value.
     names = [field.name for field in dataclasses.fields(value)]
     return {name: getattr(value, name) for name in names if name in vars(value)}
@@ -118,7 +118,7 @@ def _with_fields(kind: type, fields) -> Any:
     if not isinstance(fields, dict):
         raise NotPlain(repr(fields))
     if issubclass(kind, tuple):
-        if list(fields) != list(kind._fields):  # pyright: ignore[reportAttributeAccessIssue]
+        if list(fields) != list(kind._fields):
             raise NotPlain(repr(fields))
         return tuple.__new__(kind, fields.values())
     if not set(fields) <= {field.name for field in dataclasses.fields(kind)}:

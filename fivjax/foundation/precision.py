@@ -14,7 +14,7 @@ Two consequences are dealt with here:
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import NamedTuple, ParamSpec, TypeVar
 
 import jax
@@ -32,7 +32,7 @@ Returned = Array | np.ndarray
 
 
 @contextlib.contextmanager
-def own_settings() -> Iterator[None]:
+def own_settings() -> Generator[None]:
     """Double precision, and arrays of any rank and type together, whatever the caller has set. Each thread has settings of its
     own.
     """

@@ -17,7 +17,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import ParamSpec, TypeVar
 
 from tqdm.auto import tqdm
@@ -62,7 +62,7 @@ class Work:
                 self.bar.update(count)
 
     @contextlib.contextmanager
-    def inside(self, label: str, total: int | None, already: int, unit: str) -> Iterator["Work"]:
+    def inside(self, label: str, total: int | None, already: int, unit: str) -> Generator["Work"]:
         """Work inside this work: a stage of it, with parts of its own to count."""
         with self.lock:
             before = self.total, self.count, self.already, self.unit, self.words
@@ -123,7 +123,7 @@ _lines = contextvars.ContextVar("lines", default=False)
 @contextlib.contextmanager
 def following(
     label: str, *, shown: bool | None, total: int | None = None, already: int = 0, unit: str = " steps"
-) -> Iterator[Work]:
+) -> Generator[Work]:
     """Inside this context `stage` and `tick` report on this work, of `total` parts of which some are done `already`.
 
     It is shown if asked for; unless said, in terminals and notebooks. Inside other work it is a stage of that.
@@ -171,7 +171,7 @@ def tick(count: int = 1) -> None:
 
 
 @contextlib.contextmanager
-def in_lines() -> Iterator[None]:
+def in_lines() -> Generator[None]:
     """Inside this context, without a terminal, a line for each stage is printed in place of a bar."""
     token = _lines.set(True)
     try:
@@ -199,7 +199,7 @@ def _has_room() -> bool:
 
 
 @contextlib.contextmanager
-def _time_kept(work: Work, shown: bool | None) -> Iterator[None]:
+def _time_kept(work: Work, shown: bool | None) -> Generator[None]:
     """Inside this context a thread brings up to date what is shown of some work."""
     if work.shown_as == "nothing":
         yield

@@ -10,7 +10,7 @@ import contextlib
 import contextvars
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
@@ -24,7 +24,7 @@ PATIENCE = 2.0
 
 
 @contextlib.contextmanager
-def stop_requests() -> Iterator[list[int]]:
+def stop_requests() -> Generator[list[int]]:
     """Inside this context the first signal is only added to the list that it gives; a second one stops the run at once.
 
     At the end the former handlers are back, and a signal that was noted is sent again; but not a Ctrl-C that nobody else
@@ -73,7 +73,7 @@ def interruptible(call: Callable[[], R]) -> R:
 
 
 @contextlib.contextmanager
-def waited_for(pool: ThreadPoolExecutor, *used: ThreadPoolExecutor) -> Iterator[tuple[ThreadPoolExecutor, ...]]:
+def waited_for(pool: ThreadPoolExecutor, *used: ThreadPoolExecutor) -> Generator[tuple[ThreadPoolExecutor, ...]]:
     """A pool of threads, and others that these use, which are waited for when the context ends; where it ends by an exception,
     for `PATIENCE` at most.
     """

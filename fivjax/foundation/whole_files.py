@@ -10,7 +10,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 try:
@@ -60,7 +60,7 @@ def try_to_write(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def own_folder(parent: Path) -> Iterator[Path]:
+def own_folder(parent: Path) -> Generator[Path]:
     """A new folder for this process alone while the context lasts, then removed with all that is in it; unless it was renamed.
 
     **Raises:** `OSError` where it cannot be made.

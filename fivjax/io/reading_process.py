@@ -179,7 +179,7 @@ def _send_array(send, about: dict, variable) -> None:
 def _attributes(attrs) -> dict:
     import numpy as np
 
-    found = {}
+    found: dict[str, dict] = {}
     for name in attrs:
         value = attrs[name]
         if isinstance(value, str | bytes):

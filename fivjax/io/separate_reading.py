@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import IO
@@ -60,7 +60,7 @@ def parts_of(path: Path, what: str, kind: str) -> Iterator[tuple[dict, np.ndarra
 
 
 @contextlib.contextmanager
-def _reading(path: Path, what: str, length: int) -> Iterator[IO[bytes]]:
+def _reading(path: Path, what: str, length: int) -> Generator[IO[bytes]]:
     """The stream of a process that reads a file; the process ends with the context, or when it takes too long."""
     if not sys.executable:  # Python inside another program: there is nothing to start
         sent = BytesIO()

@@ -5,6 +5,7 @@ A small array is an array of Python objects: texts that name variables, or numbe
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -194,7 +195,7 @@ def padded(value: np.ndarray, filling: np.ndarray, params) -> np.ndarray:
 
 
 # Primitives that only move numbers, in arrays of either form.
-MOVING = {
+MOVING: dict[str, Callable] = {
     "squeeze": squeezed,
     "slice": sliced,
     "transpose": transposed,
@@ -204,7 +205,7 @@ MOVING = {
     "unstack": unstacked,
 }
 # The same, for small arrays only.
-MOVING_ENTRIES = {
+MOVING_ENTRIES: dict[str, Callable] = {
     "concatenate": lambda *parts: np.concatenate(parts[:-1], parts[-1]["dimension"]),
     "stack": lambda *parts: np.stack(parts[:-1], parts[-1]["axis"]),
     "pad": padded,

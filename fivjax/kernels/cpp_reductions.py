@@ -27,16 +27,16 @@ def folded(writer: Writer, name: str, value: Value, axes, kind: str) -> Value:
     """A reduction over some axes."""
     if value.size > FEW and not has_known_numbers(value):
         return _in_loops(writer, name, writer.view(value, kind), axes)
-    value = writer.entries(value)
+    entries = writer.entries(value)
     for axis in sorted(axes, reverse=True):
-        parts = [np.asarray(part, object) for part in np.moveaxis(value, axis, 0)]
+        parts: list = [np.asarray(part, object) for part in np.moveaxis(entries, axis, 0)]
         # By pairs, which do not wait for one another.
         while len(parts) > 1:
             pairs = zip(parts[::2], parts[1::2], strict=False)
             last = parts[len(parts) // 2 * 2 :]
             parts = [*(writer.each(name, BY_NUMBER[name], list(pair), kind) for pair in pairs), *last]
-        value = parts[0]
-    return value
+        entries = parts[0]
+    return entries
 
 
 def _in_loops(writer: Writer, name: str, value: View, axes) -> Value:

@@ -161,9 +161,8 @@ def _search(structure, start, route, highest, direction, max_steps):
             return significant_growth(_in_natural_units(structure, mu, direction))
         return -margin(structure, mu, direction=direction)
 
-    solution = optx.root_find(
-        instability, BracketedNewton(highest=highest), start, structure, max_steps=max_steps, throw=False
-    )
+    solver = BracketedNewton(highest=highest)  # pyrefly: ignore[missing-argument]
+    solution = optx.root_find(instability, solver, start, structure, max_steps=max_steps, throw=False)
     return solution, solution.state
 
 

@@ -199,7 +199,7 @@ def _all(pencil: Pencil, band: float):
     unit = np.exp(np.mean(np.log(frequencies)))
     state = np.block([[none, np.diag(frequencies)], [-stiffness / frequencies, -damping]]) / unit
     inertia = np.block([[np.eye(n), none], [none, mass]])
-    (top, bottom), vectors = eig(state, inertia, homogeneous_eigvals=True)  # pyright: ignore[reportAssignmentType]
+    (top, bottom), vectors = eig(state, inertia, homogeneous_eigvals=True)
     if np.any(np.abs(top) + np.abs(bottom) < 1e-14 * (np.abs(top) + np.abs(bottom)).max(initial=0.0)):
         raise _singular()
     finite = np.abs(bottom) > 1e-14 * np.abs(top)
@@ -287,9 +287,9 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
         x = factors.solve(-(mass @ (b + relative * a) + damping @ a))
         return np.concatenate([x, a + relative * x])
 
-    operator = LinearOperator((2 * n, 2 * n), matvec=shift_inverse, dtype=complex)  # pyright: ignore[reportCallIssue]
+    operator = LinearOperator((2 * n, 2 * n), matvec=shift_inverse, dtype=complex)  # pyrefly: ignore
     start = np.random.default_rng(0).standard_normal(2 * n) + 0j
-    values, states = eigs(operator, k=min(count, 2 * n - 2), v0=start)  # pyright: ignore[reportAssignmentType]
+    values, states = eigs(operator, k=min(count, 2 * n - 2), v0=start)
     values = shift + unit / values
     # Eigenvalues this near to the real axis, relative to the shift, are found again in real arithmetic; rounding moves even
     # double ones by less.

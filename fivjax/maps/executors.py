@@ -40,7 +40,7 @@ def with_workers(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         check_executor(executor)
         with contextlib.closing(Workers(executor)) as workers:
-            return function(*args, **{**kwargs, "executor": workers})
+            return function(*args, **{**kwargs, "executor": workers})  # pyrefly: ignore[invalid-param-spec]
 
     return wrapped
 

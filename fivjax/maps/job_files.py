@@ -109,7 +109,8 @@ class JobFile:
 
     def __init__(self, path: str | None, key: str):
         self.path, self.key = None if path is None else Path(path), key
-        self._written, self._took, self._noted = time.monotonic(), 0.0, None
+        self._written, self._took = time.monotonic(), 0.0
+        self._noted: JobState | None = None
 
     def last(self) -> JobState | None:
         """The state in which an interrupted run of the job was kept, if there is one."""

@@ -32,7 +32,7 @@ class FrictionPerContact(AbstractFriction):
 
     # A class variable of the base class, but here it depends on the laws.
     @property
-    def constant(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def constant(self) -> bool:
         return all(law.constant for law in self.laws)
 
     @property

@@ -118,8 +118,8 @@ def _of_trajectory(run: Trajectory, of_phase_plane: float = 0.25, figure: Figure
     figure = Figure(figsize=(10.0, 3.4), layout="constrained") if figure is None else figure
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(5, 3)), object)
     # A subfigure has all methods that these functions need.
-    plot.response(run, **options, figure=left)  # pyright: ignore[reportArgumentType]
-    plot.phase_plane(run, last=of_phase_plane * float(run.t[-1]), figure=right)  # pyright: ignore[reportArgumentType]
+    plot.response(run, **options, figure=left)
+    plot.phase_plane(run, last=of_phase_plane * float(run.t[-1]), figure=right)
     return figure
 
 

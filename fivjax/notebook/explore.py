@@ -1,4 +1,3 @@
-# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
 """An explorer for notebooks: sliders for a scene's parameters, and its response at once, from code compiled once."""
 
 import json

@@ -229,7 +229,7 @@ class _Seen:
         self._number_flights(status, after, fired, impact)
         felt = np.any(self.coupled[fired], axis=0)
         felt[fired] = False
-        self.struck, self.before = felt & (after == status), look.guards[-1]
+        self.struck, self.before = felt & (after == status), np.asarray(look.guards[-1])
         return bool(fired)
 
     def _number_flights(self, status: np.ndarray, after: np.ndarray, fired: list[int], impact: bool) -> None:

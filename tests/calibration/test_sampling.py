@@ -87,7 +87,7 @@ def test_an_average_holds_the_impulse_of_a_landing():
 
 def butterworth(order):
     """SciPy's coefficients of an analogue filter of 400 Hz."""
-    above, below = scipy.signal.butter(order, 2 * np.pi * 400.0, analog=True)  # pyright: ignore[reportGeneralTypeIssues]
+    above, below = scipy.signal.butter(order, 2 * np.pi * 400.0, analog=True)
     return above, below
 
 

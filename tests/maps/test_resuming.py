@@ -63,7 +63,7 @@ def own_stepper(share):
         def advance(self, mechanics, contact, load, y, h, at_section=False):
             return super().advance(mechanics, contact, load, y, share * h, at_section)
 
-    return Halved()  # pyright: ignore[reportCallIssue]
+    return Halved()
 
 
 def scene(friction=None, structure=None) -> fj.Scene:

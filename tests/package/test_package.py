@@ -48,14 +48,15 @@ def test_a_type_checker_is_told_to_look():
     assert (Path(fj.__file__).parent / "py.typed").is_file()
 
 
-@pytest.mark.slow
 def test_a_user_s_file_is_clean_to_a_type_checker():
     """Rejects a public name whose type a checker cannot see, or sees wrongly."""
     command = [
         sys.executable,
         "-m",
-        "pyright",
-        "--pythonpath",
+        "pyrefly",
+        "check",
+        "--error=missing-attribute",
+        "--python-interpreter-path",
         sys.executable,
         str(ROOT / "tests" / "helpers" / "typed_user.py"),
     ]
