@@ -52,7 +52,7 @@ def approaches(
     found: list[Approach | None] = [None] * len(cycles)
     # Where motions come from the edge of a tube to the neighbourhood in fewer returns than this, that says enough.
     worthwhile = 96
-    small = [k for k, cycle in enumerate(cycles) if _returns_from(cycle, 0.5 * tube.RADIUS) > worthwhile]
+    small = [k for k, cycle in enumerate(cycles) if returns_from(cycle, 0.5 * tube.RADIUS) > worthwhile]
     locked = [k for k in small if len(cycles[k].points) > CROSSINGS]
     for chosen, how in ([k for k in small if k not in locked], ABOUT_CYCLES), (locked, ABOUT_LOCKED_TORI):
         if not chosen:
@@ -70,7 +70,7 @@ def approaches(
     return found
 
 
-def _returns_from(cycle: StableCycle, away: float) -> float:
+def returns_from(cycle: StableCycle, away: float) -> float:
     """Returns in which motions so far from a cycle, relative to its size, come to its neighbourhood by its multiplier."""
     return np.log(max(away / cycle.reach, 1.0)) * len(cycle.points) / (1 - cycle.multiplier)
 
@@ -112,7 +112,7 @@ def _followed_into(
     """Further weighted states of pilots, which have these rows for each cycle, until they are in its neighbourhood, by the
     cycle's place: of those where they come there in twice the time that the cycle's multiplier says.
     """
-    within = np.array([how.kept + tube.RETURNS_INSIDE + 2 * _returns_from(cycle, how.away) for cycle in cycles])
+    within = np.array([how.kept + tube.RETURNS_INSIDE + 2 * returns_from(cycle, how.away) for cycle in cycles])
     states: dict[int, list] = {k: [] for k in range(len(cycles))}
     # Of a torus that is locked weakly it is enough that it is drawn in: on a closed curve that has a periodic motion all others
     # come to such ones.

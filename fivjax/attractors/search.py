@@ -15,12 +15,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
+from .approach import LONGEST, returns_from
 from .catalogue import Attractors, Catalogue
 from .cycles import AT_FIRST, CROSSINGS, MORE_CROSSINGS, Recurrence
 from .motions import Motions, far_apart
 
 # Groups whose motions are followed at once: the paths of those that may be on tori take memory, some 0.2 MB each.
 TOGETHER = 256
+# Returns after which motions that are followed are asked whether they have been captured.
+FOLLOWED = 256
 
 
 def search_groups(
@@ -79,6 +82,36 @@ def search_from(catalogue: Catalogue, motions: Motions) -> Motions:
             captured[list(catalogue.captures(motions, ~captured))] = True
         motions = motions.rows(~captured)
     return motions.rows(catalogue.add_tori_by_turns(motions, np.ones(len(motions.group), bool)))
+
+
+def follow_into_slow_cycles(catalogue: Catalogue, motions: Motions) -> Motions:
+    """Those of the motions that nothing captures in twice the time in which the slowest known cycle of their group draws them
+    in, from as far away as it is large; they are where they are then. A few of each group are followed first, and the others
+    only where one of these is captured.
+    """
+    maps, group = catalogue.maps, motions.group
+    slowest = {
+        g: max((returns_from(one, 1.0) for one in own.cycles), default=0.0) for g, own in catalogue.of_group.items()
+    }
+    within = np.minimum([2 * slowest[g] for g in group.tolist()], LONGEST)
+    motions, left, every = motions.rows(np.arange(len(group))), np.ones(len(group), bool), np.arange(len(group))
+    few = far_apart(maps.weights * motions.at.y, group, within > 0)
+    for some in (few, np.delete(every, few)):
+        some = some[within[some] > 0]
+        for done in range(0, LONGEST, FOLLOWED):
+            rows = some[left[some] & (within[some] > done)]
+            if not len(rows):
+                break
+            catalogue.report(0)
+            later = maps.returns(*motions.rows(rows), FOLLOWED)
+            # One without events fades, most likely.
+            goes_on = np.all(np.isfinite(later.at.y), axis=1) & (later.events > 0)
+            within[rows[~goes_on]] = 0.0
+            rows = rows[goes_on]
+            motions.at.put(rows, later.at.rows(goes_on))
+            left[rows[list(catalogue.captures(motions.rows(rows), np.ones(len(rows), bool)))]] = False
+        within[~np.isin(group, group[some[~left[some]]])] = 0.0
+    return motions.rows(left)
 
 
 def _follow_lasting(maps: ReturnMaps, motions: Motions, returns: int) -> Motions:

@@ -12,8 +12,8 @@ from ..attractors.catalogue import Attractors, Catalogue
 from ..attractors.closing import close_near, closed_at
 from ..attractors.cycles import StableCycle, in_families
 from ..attractors.long_run import fates
-from ..attractors.motions import Motions
-from ..attractors.search import search_from
+from ..attractors.motions import Motions, far_apart
+from ..attractors.search import follow_into_slow_cycles, search_from
 from ..contact import Contact, State, Status
 from ..foundation import arguments
 from ..foundation.numpy_evaluation import by_numpy
@@ -41,6 +41,8 @@ FURTHER_LOADS, FURTHER_SPEEDS = (0.5, 10.0, 20.0), (-4.0, -2.0, -1.0, 2.0, 4.0)
 SLOWER, STEPS = (0.7, 0.4), 6
 # The most modes along which motions are released: those that grow fastest, or decay most slowly.
 MOST_MODES = 8
+# Motions that are followed for thousands of returns at a time.
+MOST_FOLLOWED = 12
 # The largest number of points of the section in one period that is tried for a periodic motion near a start.
 MOST_CROSSINGS = 12
 
@@ -137,7 +139,10 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
             f"Argument `starts` must be a list of states `(2n,)` or trajectories, but is {arguments.describe(starts)}."
         )
     given = [state_of(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
-    return _met(scene, [*given, *_kicked(scene)], _at_random(scene)).cycles
+    given += [state_of(scene, kicked) for kicked in _kicked(scene)]
+    # Apart from all others, of which only a few are followed for long.
+    given = [np.array(given) - np.asarray(sliding_state(scene, scene.load.final))] if given else []
+    return _met(scene, *given, _at_random(scene)).cycles
 
 
 def _kicked(scene: Scene) -> list[Trajectory]:
@@ -172,12 +177,12 @@ class Met(NamedTuple):
     left: int  # motions that go on, and come to nothing that could be computed
 
 
-def _met(scene: Scene, starts: Sequence = (), *beside: Float[np.ndarray, "m 2n"]) -> Met:
-    """What motions come to that are released about steady sliding and from `starts`, and then from what is `beside`, deviations
-    from sliding: the further ones only if there is no cycle yet, and then a cycle that is followed from a lower belt speed.
+def _met(scene: Scene, *beside: Float[np.ndarray, "m 2n"]) -> Met:
+    """What motions come to that are released about steady sliding, and then from what is `beside`, deviations from sliding; if
+    there is no cycle yet, the further ones, and then a cycle that is followed from a lower belt speed.
     """
     maps = ReturnMaps.of(scene)
-    released = np.concatenate([_released(scene, LOADS, SPEEDS, starts), _along_modes(scene, maps)])
+    released = np.concatenate([_released(scene, LOADS, SPEEDS), _along_modes(scene, maps)])
     met = attractors_met(maps, scene, released, *beside)
     if not met.cycles:
         further = attractors_met(maps, scene, _released(scene, FURTHER_LOADS, FURTHER_SPEEDS))
@@ -217,21 +222,37 @@ def attractors_met(maps: ReturnMaps, scene: Scene, *states: Float[np.ndarray, "m
         stage("searching")
 
     found, in_family, left = Attractors.none(), 0, 0
-    catalogue = Catalogue(maps, {0: found}, report)
+    # So many motions are released that approaches repay.
+    catalogue = Catalogue(maps, {0: found}, report, from_afar=True)
     for some in states:
         stage("releasing motions")
         group = np.zeros(len(some), int)
         motions = search_from(catalogue, Motions(group, maps.in_contact(group, some)))
         families = in_families(maps, motions)
         motions, in_family = motions.rows(~families), in_family + int(np.sum(families))
-        if len(motions.group):
-            stage(f"following {len(motions.group)} motions")
-            fate = fates(catalogue, motions)
-            left += len(motions.group) - len(fate.attractor) - int(np.sum(fate.without_events))
+        left += _follow_on(catalogue, motions)
     stage("describing what was found")
     cycles = [_described(maps, scene, one) for one in found.cycles]
     cycles += [limit_cycle_of_torus(maps, scene, one) for one in found.tori]
     return Met(sorted(cycles, key=lambda one: -one.amplitude), in_family, left)
+
+
+def _follow_on(catalogue: Catalogue, motions: Motions) -> int:
+    """Adds the attractors to which these motions come in thousands of returns, and tells how many come to nothing."""
+    weights = catalogue.maps.weights
+    # Most go where others have gone, and need not be asked for as long as the few whose fate is unknown.
+    while len((motions := follow_into_slow_cycles(catalogue, motions)).group):
+        stage(f"following {len(motions.group)} motions")
+        every = np.ones(len(motions.group), bool)
+        few = far_apart(weights * motions.at.y, motions.group, every, MOST_FOLLOWED)
+        fate, every[few] = fates(catalogue, motions.rows(few)), False
+        motions = motions.rows(every)
+        if not fate.attractor:
+            # Where none of these comes to anything, neither do the others.
+            left = len(few) - int(np.sum(fate.without_events))
+            return left and left + len(motions.group)
+        motions = motions.rows(~catalogue.has_captured(motions))
+    return 0
 
 
 def _described(maps: ReturnMaps, scene: Scene, cycle: StableCycle) -> LimitCycle:
@@ -255,18 +276,14 @@ def _released_states(scene: Scene, loads: Float[jax.Array, " e"]) -> State:
     return jax.vmap(lambda load: sliding_state(scene, load * scene.load.final) - rest)(loads)
 
 
-def _released(
-    scene: Scene, loads: Sequence[float], speeds: Sequence[float], starts: Sequence = ()
-) -> Float[np.ndarray, "m 2n"]:
-    """States (deviations from sliding) at rest under multiples of the final load, sliding steadily with multiples of the belt's
-    speed, and given ones.
+def _released(scene: Scene, loads: Sequence[float], speeds: Sequence[float]) -> Float[np.ndarray, "m 2n"]:
+    """States (deviations from sliding) at rest under multiples of the final load, and sliding steadily with multiples of the
+    belt's speed.
     """
-    rest = np.asarray(sliding_state(scene, scene.load.final))
     tangential, _ = contact_coordinates(scene.structure)
-    moved = np.zeros((len(speeds), len(rest)))
+    moved = np.zeros((len(speeds), 2 * scene.structure.size))
     moved[:, scene.structure.size + np.atleast_1d(tangential)] = np.outer(speeds, np.atleast_1d(scene.belt_speed))
-    given = [state_of(scene, start) - rest for start in starts]
-    return np.concatenate([np.asarray(_released_states(scene, np.asarray(loads))), moved, *np.array(given)[:, None]])
+    return np.concatenate([np.asarray(_released_states(scene, np.asarray(loads))), moved])
 
 
 def _along_modes(scene: Scene, maps: ReturnMaps) -> Float[np.ndarray, "m 2n"]:
