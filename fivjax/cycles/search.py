@@ -73,9 +73,9 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
     **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene), or a
     pair of a state `(2n,)` in m and m/s and a status, of which what the status sets to zero, such as the gap, is not looked
     at. From such a start, an unstable cycle may be found, too. Without `start`, motions are released from rest under several
-    loads, from sticking, and along the modes of steady sliding (eight at most); where none comes to a cycle, with larger kicks
+    loads and from sticking; where none comes to a cycle, along the modes of steady sliding (eight at most), with larger kicks
     to both sides, and then from a cycle at a lower belt speed. Of the stable cycles and tori that they come to, the one with
-    the largest amplitude is returned: they are found and proved as those of a map are.
+    the largest amplitude is returned: they are found and proved as those of a map are. `limit_cycles` looks for others.
     `progress`: whether to show what it is doing; unless given, in terminals and notebooks.
 
     **Returns:** a `LimitCycle`.
@@ -182,11 +182,15 @@ def _met(scene: Scene, *beside: Float[np.ndarray, "m 2n"]) -> Met:
     there is no cycle yet, the further ones, and then a cycle that is followed from a lower belt speed.
     """
     maps = ReturnMaps.of(scene)
-    released = np.concatenate([_released(scene, LOADS, SPEEDS), _along_modes(scene, maps)])
+    released, along_modes = _released(scene, LOADS, SPEEDS), _along_modes(scene, maps)
+    further = along_modes, _released(scene, FURTHER_LOADS, FURTHER_SPEEDS)
+    if beside:
+        released, further = np.concatenate([released, along_modes]), further[1:]
     met = attractors_met(maps, scene, released, *beside)
-    if not met.cycles:
-        further = attractors_met(maps, scene, _released(scene, FURTHER_LOADS, FURTHER_SPEEDS))
-        met = Met(further.cycles, met.in_families + further.in_families, met.left + further.left)
+    for states in further:
+        if not met.cycles and len(states):
+            more = attractors_met(maps, scene, states)
+            met = Met(more.cycles, met.in_families + more.in_families, met.left + more.left)
     if not met.cycles and (cycle := _from_slower(scene)) is not None:
         met = met._replace(cycles=[cycle])
     return met
