@@ -178,8 +178,9 @@ class Met(NamedTuple):
 
 
 def _met(scene: Scene, *beside: Float[np.ndarray, "m 2n"]) -> Met:
-    """What motions come to that are released about steady sliding, and then from what is `beside`, deviations from sliding; if
-    there is no cycle yet, the further ones, and then a cycle that is followed from a lower belt speed.
+    """What motions come to that are released about steady sliding; if there is no cycle yet, the further ones, and then a cycle
+    that is followed from a lower belt speed. If there are states `beside` (deviations from sliding), all cycles are sought:
+    motions along modes and from these states are always released.
     """
     maps = ReturnMaps.of(scene)
     released, along_modes = _released(scene, LOADS, SPEEDS), _along_modes(scene, maps)
