@@ -85,16 +85,16 @@ def search_from(catalogue: Catalogue, motions: Motions) -> Motions:
 
 
 def follow_into_slow_cycles(catalogue: Catalogue, motions: Motions) -> Motions:
-    """Those of the motions that nothing captures in twice the time in which the slowest known cycle of their group draws them
-    in, from as far away as it is large; they are where they are then. A few of each group are followed first, and the others
-    only where one of these is captured.
+    """What is left of the motions, each where it was last followed to, without those that an attractor captures in twice the
+    time in which the slowest known cycle of their group draws them in, from as far away as it is large; in `LONGEST` returns at
+    most. A few of each group are followed first, and the others only where one of these is captured.
     """
-    maps, group = catalogue.maps, motions.group
+    maps, group, every = catalogue.maps, motions.group, np.arange(len(motions.group))
     slowest = {
         g: max((returns_from(one, 1.0) for one in own.cycles), default=0.0) for g, own in catalogue.of_group.items()
     }
     within = np.minimum([2 * slowest[g] for g in group.tolist()], LONGEST)
-    motions, left, every = motions.rows(np.arange(len(group))), np.ones(len(group), bool), np.arange(len(group))
+    motions, left = motions.rows(every), np.ones(len(group), bool)
     few = far_apart(maps.weights * motions.at.y, group, within > 0)
     for some in (few, np.delete(every, few)):
         some = some[within[some] > 0]

@@ -49,7 +49,7 @@ def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
         for name in own:
             given[name] = _inside(scene, given[name], name)
         # Anything else is refused by the function.
-        if {"starts"} & set(names) & given.keys() and arguments.is_listed(given["starts"]):
+        if "starts" in names and arguments.is_listed(given.get("starts")):
             given["starts"] = [_inside(scene, one, f"starts[{number}]") for number, one in enumerate(given["starts"])]
         given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
         return _outside(scene, call(**given))

@@ -1,6 +1,7 @@
 """Limit cycles: motions are released, their attractors are found as those of a map are, and described."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -41,7 +42,7 @@ FURTHER_LOADS, FURTHER_SPEEDS = (0.5, 10.0, 20.0), (-4.0, -2.0, -1.0, 2.0, 4.0)
 SLOWER, STEPS = (0.7, 0.4), 6
 # The most modes along which motions are released: those that grow fastest, or decay most slowly.
 MOST_MODES = 8
-# Motions that are followed for thousands of returns at a time.
+# The most motions at a time whose fates are worked out, over thousands of returns.
 MOST_FOLLOWED = 12
 # The largest number of points of the section in one period that is tried for a periodic motion near a start.
 MOST_CROSSINGS = 12
@@ -140,7 +141,7 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
         )
     given = [state_of(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
     given += [state_of(scene, kicked) for kicked in _kicked(scene)]
-    # Apart from all others, of which only a few are followed for long.
+    # Apart from the others: of each batch only some have their fates worked out (`MOST_FOLLOWED`).
     given = [np.array(given) - np.asarray(sliding_state(scene, scene.load.final))] if given else []
     return _met(scene, *given, _at_random(scene)).cycles
 
@@ -174,7 +175,7 @@ class Met(NamedTuple):
 
     cycles: list[LimitCycle]  # attractors, the one with the largest amplitude first
     in_families: int  # motions that close, but are one of a family of such
-    left: int  # motions that go on, and come to nothing that could be computed
+    left: int  # motions that were followed for long, go on, and come to nothing that could be computed
 
 
 def _met(scene: Scene, *beside: Float[np.ndarray, "m 2n"]) -> Met:
@@ -183,13 +184,15 @@ def _met(scene: Scene, *beside: Float[np.ndarray, "m 2n"]) -> Met:
     motions along modes and from these states are always released.
     """
     maps = ReturnMaps.of(scene)
-    released, along_modes = _released(scene, LOADS, SPEEDS), _along_modes(scene, maps)
-    further = along_modes, _released(scene, FURTHER_LOADS, FURTHER_SPEEDS)
+    released = _released(scene, LOADS, SPEEDS)
+    along_modes = functools.partial(_along_modes, scene, maps)
+    further = [along_modes, functools.partial(_released, scene, FURTHER_LOADS, FURTHER_SPEEDS)]
     if beside:
-        released, further = np.concatenate([released, along_modes]), further[1:]
+        released = np.concatenate([released, along_modes()])
+        further.remove(along_modes)
     met = attractors_met(maps, scene, released, *beside)
-    for states in further:
-        if not met.cycles and len(states):
+    for states_of in further:
+        if not met.cycles and len(states := states_of()):
             more = attractors_met(maps, scene, states)
             met = Met(more.cycles, met.in_families + more.in_families, met.left + more.left)
     if not met.cycles and (cycle := _from_slower(scene)) is not None:
@@ -227,7 +230,7 @@ def attractors_met(maps: ReturnMaps, scene: Scene, *states: Float[np.ndarray, "m
         stage("searching")
 
     found, in_family, left = Attractors.none(), 0, 0
-    # So many motions are released that approaches repay.
+    # Where a cycle attracts slowly, most of the many motions of `limit_cycles` would be followed for thousands of returns.
     catalogue = Catalogue(maps, {0: found}, report, from_afar=True)
     for some in states:
         stage("releasing motions")
@@ -243,19 +246,21 @@ def attractors_met(maps: ReturnMaps, scene: Scene, *states: Float[np.ndarray, "m
 
 
 def _follow_on(catalogue: Catalogue, motions: Motions) -> int:
-    """Adds the attractors to which these motions come in thousands of returns, and tells how many come to nothing."""
+    """Adds the attractors to which these motions come in thousands of returns, and tells how many of the last that were asked
+    go on, if none of those came to one.
+    """
     weights = catalogue.maps.weights
     # Most go where others have gone, and need not be asked for as long as the few whose fate is unknown.
     while len((motions := follow_into_slow_cycles(catalogue, motions)).group):
         stage(f"following {len(motions.group)} motions")
         every = np.ones(len(motions.group), bool)
         few = far_apart(weights * motions.at.y, motions.group, every, MOST_FOLLOWED)
-        fate, every[few] = fates(catalogue, motions.rows(few)), False
+        fate = fates(catalogue, motions.rows(few))
+        every[few] = False
         motions = motions.rows(every)
         if not fate.attractor:
             # Where none of these comes to anything, neither do the others.
-            left = len(few) - int(np.sum(fate.without_events))
-            return left and left + len(motions.group)
+            return len(few) - int(np.sum(fate.without_events))
         motions = motions.rows(~catalogue.has_captured(motions))
     return 0
 

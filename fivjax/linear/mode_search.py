@@ -287,7 +287,9 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
         x = factors.solve(-(mass @ (b + relative * a) + damping @ a))
         return np.concatenate([x, a + relative * x])
 
-    operator = LinearOperator((2 * n, 2 * n), matvec=shift_inverse, dtype=complex)  # pyrefly: ignore
+    shape = 2 * n, 2 * n
+    # pyrefly: ignore[missing-argument, unexpected-keyword, bad-keyword-argument]
+    operator = LinearOperator(shape, matvec=shift_inverse, dtype=complex)
     start = np.random.default_rng(0).standard_normal(2 * n) + 0j
     values, states = eigs(operator, k=min(count, 2 * n - 2), v0=start)
     values = shift + unit / values

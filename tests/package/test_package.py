@@ -55,7 +55,7 @@ def test_a_user_s_file_is_clean_to_a_type_checker():
         "-m",
         "pyrefly",
         "check",
-        "--error=missing-attribute",
+        "--error=missing-attribute,bad-argument-type",
         "--python-interpreter-path",
         sys.executable,
         str(ROOT / "tests" / "helpers" / "typed_user.py"),
