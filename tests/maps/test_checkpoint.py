@@ -26,7 +26,9 @@ AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
 
 @pytest.fixture
 def at_once(monkeypatch):
+    # After each job, however long the write before it took.
     monkeypatch.setattr(checkpoint, "KEEP_EVERY", 0.0)
+    monkeypatch.setattr(checkpoint, "SHARE_OF_TIME", 0.0)
     monkeypatch.setattr(plan, "IN_A_JOB", 5)
 
 
