@@ -114,7 +114,9 @@ class Problem(eqx.Module):
             # A cycle that is not finite will not close any more.
             if correction <= CLOSED or not np.isfinite(correction):
                 break
+        # pyrefly: ignore[unbound-name]
         residual, jacobian = np.asarray(found.residual), np.asarray(found.jacobian)
+        # pyrefly: ignore[unbound-name]
         if not (correction <= CLOSED and np.isfinite(residual).all() and np.isfinite(jacobian).all()):
             return Evaluated(np.full_like(residual, np.inf), np.zeros_like(jacobian), found.about)
         return Evaluated(residual, jacobian, found.about)

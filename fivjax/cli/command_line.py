@@ -46,6 +46,7 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
         print(f"fivjax {fj.__version__}")
         return 0
     with options():
+        # pyrefly: ignore[no-matching-overload]
         command = tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
             prog="fivjax",

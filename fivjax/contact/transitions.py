@@ -161,6 +161,7 @@ def _struck(
     own = gap_rate(mechanics, y_struck)
     rests = rising | (touched & _ends_within(resolution, own, fall))
     if mechanics.several and lifts_rest:
+        # pyrefly: ignore[unbound-name]
         lifted = reached & (contact.status != Status.DETACH) & (own > 0)
         free = Contact(jnp.where(lifted, Status.DETACH, contact.status), contact.direction)
         rests = rests | (lifted & _ends_within(resolution, own, _fall(mechanics, free, load, y)))

@@ -9,11 +9,12 @@ def apart(*values: float, digits: int = ORDINARY) -> tuple[str, ...]:
     # With these, different numbers in double precision look different.
     most = 17
     numbers = [float(value) for value in values]
-    for count in range(digits, most + 1):
-        texts = tuple(f"{number:.{count}g}" for number in numbers)
-        if len(set(texts)) >= len({number for number in numbers if number == number}):
-            break
-    return texts
+    different = len({number for number in numbers if number == number})
+    while True:
+        texts = tuple(f"{number:.{digits}g}" for number in numbers)
+        if len(set(texts)) >= different or digits >= most:
+            return texts
+        digits += 1
 
 
 def counted(count: int, one: str, several: str | None = None) -> str:

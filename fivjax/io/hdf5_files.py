@@ -1,6 +1,7 @@
 """NetCDF files, which are HDF5: read in a process of its own, which a damaged one may crash."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,7 @@ def read_netcdf(path: Path) -> tuple[dict, dict[str, tuple[list[str], np.ndarray
 
 
 def _attributes(sent: dict) -> dict:
-    found = {}
+    found: dict[str, Any] = {}
     for name, value in sent.items():
         if "hex" in value:
             array = np.frombuffer(bytes.fromhex(value["hex"]), value["dtype"]).reshape(value["shape"])

@@ -69,7 +69,7 @@ def with_derivatives(
             answer = method(here, (low[row], high[row]), names)
             # In a wide bracket another crossing may be near, which is not the first.
             if answer is not None and (attempt > 0 or low[row] <= answer.p <= high[row]):
-                critical[row] = answer
+                critical[int(row)] = answer
         known = np.array(list(critical), int)
         if not len(known):
             continue

@@ -66,7 +66,10 @@ class SmallestPerturbation(NamedTuple):
         """
         if self.over == "state":
             displacement, velocity = np.split(np.asarray(self.values), 2)
-            values = {"displacement": ("coordinate", displacement), "velocity": ("coordinate", velocity)}
+            values: dict[str, tuple] = {
+                "displacement": ("coordinate", displacement),
+                "velocity": ("coordinate", velocity),
+            }
         else:
             values = {"p": ("piece", np.asarray(self.values))}
         unit = "sqrt(J)" if self.over == "state" else "1"

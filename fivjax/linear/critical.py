@@ -92,6 +92,7 @@ def _checked(structure: Structure, direction) -> Structure:
         held, motions = linalg.eigh(units[:, None] * stiffness * units)
         motions = units[:, None] * motions
         moved = np.abs(motions[np.isin(free, tangential)]).max(axis=0)
+        # pyrefly: ignore[unsupported-operation]
         if np.any((held < 1e-12) & (moved > 1e-9 * np.abs(motions).max(axis=0))):
             raise NoSteadySliding(
                 "There is no steady sliding: friction moves a part of the structure that no spring holds. "

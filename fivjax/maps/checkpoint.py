@@ -205,9 +205,10 @@ def read_checkpoint(path: Path, run: dict) -> Contents | None:
         return None
     try:
         data = path.read_bytes()
-        kept = contents_from_bytes(data)
     except OSError as error:
         raise ValueError(f"Checkpoint `{path}` cannot be read: {error.strerror}.") from None
+    try:
+        kept = contents_from_bytes(data)
     except Damaged:
         if KIND.encode() not in data:
             raise ValueError(

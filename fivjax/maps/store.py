@@ -161,6 +161,7 @@ class Store:
                 nothing = np.full(math.prod(shape), self.arrays[name].fill_value, fields[name].dtype)
                 values = earlier.get(name, nothing)
                 values[inside] = fields[name][rows]
+                # pyrefly: ignore[unsupported-operation]
                 self.arrays[name][self.tiles.slices(number)] = values.reshape(shape)
                 _sync(self._chunk(name, number))
         Path(self.job_file(places)[0]).unlink(missing_ok=True)

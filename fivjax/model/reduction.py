@@ -137,10 +137,12 @@ def craig_bampton(
         shape = factors.solve(structure.load_direction[inner])
         if np.any(shape):
             # The part of it that the modes do not represent (they are orthonormal in the mass matrix).
+            # pyrefly: ignore[unbound-name]
             rest = shape - modes @ (modes.T @ (mass[inner][:, inner] @ shape))
             if rest @ held @ rest > new_shape**2 * (shape @ held @ shape):
                 norm = np.sqrt(rest @ mass[inner][:, inner] @ rest)
                 modes = np.column_stack([modes, rest / norm])
+        # pyrefly: ignore[unbound-name]
         columns.append(np.zeros((structure.size, modes.shape[1])))
         columns[1][inner] = modes
     basis = np.hstack(columns)

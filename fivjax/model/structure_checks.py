@@ -282,6 +282,7 @@ def _of_indefinite(shifted: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, n
     sizes, turn = eigh(mass / unit / unit[:, None])
     if sizes[0] < -1e-9:
         raise np.linalg.LinAlgError("The mass matrix has a negative eigenvalue.")
+    # pyrefly: ignore[unsupported-operation]
     kept = sizes > 1e-12
     root = unit[:, None] * turn[:, kept] * np.sqrt(sizes[kept])
     with warnings.catch_warnings():

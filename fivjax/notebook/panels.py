@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -41,7 +42,7 @@ def drawing_panels(t1: float, contacts: int = 1) -> Callable[[Trajectory], bytes
     curves = [phase.plot([], [], color=colour, lw=0.8, marker="o", ms=3, markevery=[-1])[0] for colour in colours]
     belts = [phase.axhline(0, color=BLACK if contacts == 1 else colour, ls=":", lw=0.8) for colour in colours]
     # Between two panels, where it covers no curve.
-    place = {"loc": "lower right", "bbox_to_anchor": (1, 0.97), "borderaxespad": 0, "borderpad": 0.3}
+    place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 0.97), "borderaxespad": 0, "borderpad": 0.3}
     energy.legend(**place, ncols=2, fontsize="small", frameon=False)
     if contacts > 1:
         response.legend(**place, ncols=min(contacts, 5), fontsize="small", frameon=False)

@@ -5,6 +5,7 @@ perceptually uniform colour maps; lines differ in style as well, so that everyon
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -91,7 +92,7 @@ def fill_cells(axes: Axes, edges, where: np.ndarray, colour: str, label: str, al
 
 def legend_above(axes: Axes, handles=None, columns: int = 3) -> Legend:
     """A legend without frame above the right end of a panel, where it covers no curve."""
-    options = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": columns, "frameon": False}
+    options: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": columns, "frameon": False}
     return axes.legend(**({} if handles is None else {"handles": handles}), **options)
 
 
