@@ -12,9 +12,9 @@ measures states (`maps.axes.at_middle`): on no trajectory of the map, nor on the
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from ..section.return_maps import ReturnMaps, Section
+from ..section.return_maps import Images, ReturnMaps, Section
 from .approach import LONGEST, returns_from
 from .catalogue import Attractors, Catalogue
 from .cycles import AT_FIRST, CROSSINGS, MORE_CROSSINGS, Recurrence
@@ -103,9 +103,9 @@ def follow_into_slow_cycles(catalogue: Catalogue, motions: Motions) -> Motions:
             if not len(rows):
                 break
             catalogue.report(0)
-            later = maps.returns(*motions.rows(rows), FOLLOWED)
-            # One without events fades, most likely.
-            goes_on = np.all(np.isfinite(later.at.y), axis=1) & (later.events > 0)
+            before = motions.rows(rows)
+            later = maps.returns(*before, FOLLOWED)
+            goes_on = _goes_on(maps, before, later)
             within[rows[~goes_on]] = 0.0
             rows = rows[goes_on]
             motions.at.put(rows, later.at.rows(goes_on))
@@ -117,13 +117,17 @@ def follow_into_slow_cycles(catalogue: Catalogue, motions: Motions) -> Motions:
 def _follow_lasting(maps: ReturnMaps, motions: Motions, returns: int) -> Motions:
     """Those of the motions, so many returns later, that neither fade nor stop crossing the section."""
     half = returns // 2
-    middle = maps.returns(*motions, half).at
-    last = maps.returns(motions.group, middle, returns - half)
+    middle = Motions(motions.group, maps.returns(*motions, half).at)
+    last = maps.returns(*middle, returns - half)
+    return Motions(motions.group, last.at).rows(_goes_on(maps, middle, last))
+
+
+def _goes_on(maps: ReturnMaps, before: Motions, later: Images) -> Bool[np.ndarray, " m"]:
+    """Which of these motions neither fade nor stop crossing the section on their way to `later`."""
     with np.errstate(invalid="ignore"):
-        before, after = (np.linalg.norm(maps.weights * at.y, axis=1) for at in (middle, last.at))
-        # One that has had no event for half of the returns, and shrinks by a tenth meanwhile, fades.
-        goes_on = ~((last.events == 0) & (after < 0.9 * before)) & maps.moves(motions.group, last.at.y)
-    return Motions(motions.group, last.at).rows(goes_on)
+        was, now = (np.linalg.norm(maps.weights * at.y, axis=1) for at in (before.at, later.at))
+        # One that has had no event, and has shrunk by a tenth, fades.
+        return ~((later.events == 0) & (now < 0.9 * was)) & maps.moves(before.group, later.at.y)
 
 
 def _continue_from_seeds(catalogue: Catalogue, seeds: dict[int, int]) -> None:

@@ -42,8 +42,9 @@ FURTHER_LOADS, FURTHER_SPEEDS = (0.5, 10.0, 20.0), (-4.0, -2.0, -1.0, 2.0, 4.0)
 SLOWER, STEPS = (0.7, 0.4), 6
 # The most modes along which motions are released: those that grow fastest, or decay most slowly.
 MOST_MODES = 8
-# The most motions at a time whose fates are worked out, over thousands of returns.
-MOST_FOLLOWED = 12
+# The most motions at a time whose fates are worked out, over thousands of returns; and after how many such lots in a row that
+# go on and come to nothing the others of a batch are taken to do so as well: where one cycle is sought, and where all are.
+MOST_FOLLOWED, LOTS_FOR_ONE, LOTS_FOR_ALL = 12, 1, 3
 # The largest number of points of the section in one period that is tried for a periodic motion near a start.
 MOST_CROSSINGS = 12
 
@@ -140,10 +141,11 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
             f"Argument `starts` must be a list of states `(2n,)` or trajectories, but is {arguments.describe(starts)}."
         )
     given = [state_of(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
-    given += [state_of(scene, kicked) for kicked in _kicked(scene)]
-    # Apart from the others: of each batch only some have their fates worked out (`MOST_FOLLOWED`).
-    given = [np.array(given) - np.asarray(sliding_state(scene, scene.load.final))] if given else []
-    return _met(scene, *given, _at_random(scene)).cycles
+    kicked = [state_of(scene, motion) for motion in _kicked(scene)]
+    # Of so many at once, each has its fate worked out.
+    parts = [given[start : start + MOST_FOLLOWED] for start in range(0, len(given), MOST_FOLLOWED)]
+    sliding = np.asarray(sliding_state(scene, scene.load.final))
+    return _met(scene, *(np.array(states) - sliding for states in (*parts, kicked) if states), _at_random(scene)).cycles
 
 
 def _kicked(scene: Scene) -> list[Trajectory]:
@@ -175,7 +177,7 @@ class Met(NamedTuple):
 
     cycles: list[LimitCycle]  # attractors, the one with the largest amplitude first
     in_families: int  # motions that close, but are one of a family of such
-    left: int  # motions that were followed for long, go on, and come to nothing that could be computed
+    left: int  # motions that were followed for long, go on, and came to nothing that could be computed
 
 
 def _met(scene: Scene, *beside: Float[np.ndarray, "m 2n"]) -> Met:
@@ -190,7 +192,7 @@ def _met(scene: Scene, *beside: Float[np.ndarray, "m 2n"]) -> Met:
     if beside:
         released = np.concatenate([released, along_modes()])
         further.remove(along_modes)
-    met = attractors_met(maps, scene, released, *beside)
+    met = attractors_met(maps, scene, released, *beside, lots=LOTS_FOR_ALL if beside else LOTS_FOR_ONE)
     for states_of in further:
         if not met.cycles and len(states := states_of()):
             more = attractors_met(maps, scene, states)
@@ -221,16 +223,16 @@ def _from_slower(scene: Scene) -> LimitCycle | None:
     return None
 
 
-def attractors_met(maps: ReturnMaps, scene: Scene, *states: Float[np.ndarray, "m 2n"]) -> Met:
+def attractors_met(maps: ReturnMaps, scene: Scene, *states: Float[np.ndarray, "m 2n"], lots: int = LOTS_FOR_ONE) -> Met:
     """The attractors that motions from several states (deviations from sliding) come to. Those from later ones add to what the
-    earlier ones have met, and change none of it.
+    earlier ones have met, and change none of it. A batch is given up after so many `lots` in a row that come to nothing.
     """
 
     def report(_: int) -> None:
         stage("searching")
 
     found, in_family, left = Attractors.none(), 0, 0
-    # Where a cycle attracts slowly, most of the many motions of `limit_cycles` would be followed for thousands of returns.
+    # Where a cycle attracts slowly, motions would be followed for thousands of returns.
     catalogue = Catalogue(maps, {0: found}, report, from_afar=True)
     for some in states:
         stage("releasing motions")
@@ -238,31 +240,32 @@ def attractors_met(maps: ReturnMaps, scene: Scene, *states: Float[np.ndarray, "m
         motions = search_from(catalogue, Motions(group, maps.in_contact(group, some)))
         families = in_families(maps, motions)
         motions, in_family = motions.rows(~families), in_family + int(np.sum(families))
-        left += _follow_on(catalogue, motions)
+        left += _follow_on(catalogue, motions, lots)
     stage("describing what was found")
     cycles = [_described(maps, scene, one) for one in found.cycles]
     cycles += [limit_cycle_of_torus(maps, scene, one) for one in found.tori]
     return Met(sorted(cycles, key=lambda one: -one.amplitude), in_family, left)
 
 
-def _follow_on(catalogue: Catalogue, motions: Motions) -> int:
-    """Adds the attractors to which these motions come in thousands of returns, and tells how many of the last that were asked
-    go on, if none of those came to one.
+def _follow_on(catalogue: Catalogue, motions: Motions, lots: int) -> int:
+    """Adds the attractors to which these motions come in thousands of returns, and tells how many of those that were followed
+    go on and came to none. It ends after so many `lots` in a row of which some do, and none came to any.
     """
-    weights = catalogue.maps.weights
+    weights, left, in_vain = catalogue.maps.weights, 0, 0
     # Most go where others have gone, and need not be asked for as long as the few whose fate is unknown.
-    while len((motions := follow_into_slow_cycles(catalogue, motions)).group):
-        stage(f"following {len(motions.group)} motions")
+    while in_vain < lots and len((motions := follow_into_slow_cycles(catalogue, motions)).group):
         every = np.ones(len(motions.group), bool)
         few = far_apart(weights * motions.at.y, motions.group, every, MOST_FOLLOWED)
+        stage(f"following {len(few)} motions of {len(every)}")
         fate = fates(catalogue, motions.rows(few))
+        goes_on = np.all(np.isfinite(fate.at.y), axis=1) & ~fate.without_events
+        goes_on[list(fate.attractor)] = False
+        left += int(np.sum(goes_on))
+        in_vain = in_vain + 1 if np.any(goes_on) and not fate.attractor else 0
         every[few] = False
         motions = motions.rows(every)
-        if not fate.attractor:
-            # Where none of these comes to anything, neither do the others.
-            return len(few) - int(np.sum(fate.without_events))
         motions = motions.rows(~catalogue.has_captured(motions))
-    return 0
+    return left
 
 
 def _described(maps: ReturnMaps, scene: Scene, cycle: StableCycle) -> LimitCycle:
