@@ -67,7 +67,7 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
         if isinstance(error, MemoryError):
             print(f"fivjax: There is not enough memory for that ({error}); ask for less.", file=sys.stderr)
             return 1
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
             print(f"fivjax: What is needed on disk could not be written: {error}.", file=sys.stderr)
             return 1
         if isinstance(error, ImportError) and error.name is None:  # a sentence that says what to install

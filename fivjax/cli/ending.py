@@ -34,13 +34,17 @@ def program() -> NoReturn:
             stream.reconfigure(errors="replace")
     from .command_line import main
 
-    code = main(interrupt=_interrupt)
+    unread = 120  # Python's own code for what nobody reads any more
+    try:
+        code = main(interrupt=_interrupt)
+    except BrokenPipeError:
+        code = unread
     try:
         for stream in (sys.stdout, sys.stderr):
             if stream is not None:  # it was closed from the beginning
                 stream.flush()
-    except OSError:  # nobody reads it any more; the code is Python's own for this
-        code = code or 120
+    except OSError:
+        code = code or unread
     os._exit(code)
 
 

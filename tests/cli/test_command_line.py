@@ -10,6 +10,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import tyro
 import xarray as xr
 
 import fivjax as fj
@@ -40,12 +41,27 @@ def test_the_program_ends_at_once_with_its_code_and_all_it_has_said():
     command = [sys.executable, "-m", "fivjax"]
     ran = subprocess.run([*command, "cea", "--mu", "-1"], capture_output=True, text=True)
     assert ran.returncode == 2 and ran.stderr.startswith("fivjax: ") and "mu" in ran.stderr
+
+
+@pytest.mark.parametrize("question", [["--version"], ["--help"], ["map", "--help"]])
+def test_nothing_is_said_where_nobody_reads(question):
     reading, writing = os.pipe()
     os.close(reading)
-    assert subprocess.run([*command, "--version"], stdout=writing, stderr=subprocess.DEVNULL).returncode != 0, (
-        "nobody reads"
-    )
+    command = [sys.executable, "-m", "fivjax", *question]
+    ran = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True)
     os.close(writing)
+    assert ran.returncode == 120 and ran.stderr == ""
+
+
+def test_a_command_that_nobody_reads_any_more_is_no_failure_of_the_disk(monkeypatch, capsys):
+    class Cycle:
+        def run(self):
+            raise BrokenPipeError
+
+    monkeypatch.setattr(tyro.extras, "subcommand_cli_from_dict", lambda *_, **__: Cycle())
+    with pytest.raises(BrokenPipeError):
+        main(["cycle"])
+    assert capsys.readouterr().err == ""
 
 
 def test_the_module_is_the_program():
