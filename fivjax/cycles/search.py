@@ -44,7 +44,7 @@ SLOWER, STEPS = (0.7, 0.4), 6
 MOST_MODES = 8
 # The most motions at a time whose fates are worked out, over thousands of returns; and after how many such lots in a row that
 # go on and come to nothing the others of a batch are taken to do so as well: where one cycle is sought, and where all are.
-MOST_FOLLOWED, LOTS_FOR_ONE, LOTS_FOR_ALL = 12, 1, 3
+MOST_FOLLOWED, LOTS_FOR_ONE, LOTS_FOR_ALL = 12, 1, 2
 # The largest number of points of the section in one period that is tried for a periodic motion near a start.
 MOST_CROSSINGS = 12
 

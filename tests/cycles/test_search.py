@@ -110,7 +110,7 @@ def test_where_some_fade_the_others_are_asked_all_the_same(followed):
     assert left == 0 and sorted(asked) == list(range(MANY))
 
 
-@pytest.mark.parametrize("lots", [1, 3])
+@pytest.mark.parametrize("lots", [1, 2])
 def test_a_batch_is_given_up_after_lots_that_go_on_to_nothing(followed, lots):
     left, asked = followed(["goes on"] * 9, lots)
     assert left == len(asked) == lots * search.MOST_FOLLOWED
