@@ -72,13 +72,14 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
     zero), found by Newton's method with the exact derivative of $P$ through every contact event (with several contacts, by
     differences).
 
-    **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene), or a
-    pair of a state `(2n,)` in m and m/s and a status, of which what the status sets to zero, such as the gap, is not looked
-    at. From such a start, an unstable cycle may be found, too. Without `start`, motions are released from rest under several
-    loads and from sticking; where none comes to a cycle, along the modes of steady sliding (eight at most), with larger kicks
-    to both sides, and then from a cycle at a lower belt speed. Of the stable cycles and tori that they come to, the one with
-    the largest amplitude is returned: they are found and proved as those of a map are. `limit_cycles` looks for others.
-    `progress`: whether to show what it is doing; unless given, in terminals and notebooks.
+    **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene; of a
+    torus first the middle of its points, around which it winds), or a pair of a state `(2n,)` in m and m/s and a status, of
+    which what the status sets to zero, such as the gap, is not looked at. From such a start, an unstable cycle may be found,
+    too. Without `start`, motions are released from rest under several loads and from sticking; where none comes to a cycle,
+    along the modes of steady sliding (eight at most), with larger kicks to both sides, and then from a cycle at a lower belt
+    speed. Of the stable cycles and tori that they come to, the one with the largest amplitude is returned: they are found and
+    proved as those of a map are. `limit_cycles` looks for others. `progress`: whether to show what it is doing; unless given,
+    in terminals and notebooks.
 
     **Returns:** a `LimitCycle`.
 
@@ -335,11 +336,17 @@ def state_of(scene: Scene, start, name: str = "start") -> np.ndarray:
 def _closed_from(scene: Scene, start) -> LimitCycle | None:
     """The cycle that Newton's method closes from a motion near it, stable or not."""
     maps = ReturnMaps.of(scene)
-    guess, crossings = _guess(maps, scene, start)
-    for count in crossings:
-        closed = close_near(maps, guess, count)
-        if closed is not None and maps.moves(np.zeros(1, int), np.asarray(closed.point.y)[None])[0]:
-            return limit_cycle_of(maps, scene, closed)
+    starts = [start]
+    if isinstance(start, LimitCycle) and start.kind == "torus":
+        # The cycle around which a torus winds is nearer to its middle than to any of its points.
+        amid = np.mean(start.points, axis=0) - start.deviation
+        starts.insert(0, dataclasses.replace(start, state=start.state + amid))
+    for begin in starts:
+        guess, crossings = _guess(maps, scene, begin)
+        for count in crossings:
+            closed = close_near(maps, guess, count)
+            if closed is not None and maps.moves(np.zeros(1, int), np.asarray(closed.point.y)[None])[0]:
+                return limit_cycle_of(maps, scene, closed)
     return None
 
 
