@@ -123,7 +123,7 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
     """All stable limit cycles that a search finds.
 
     Motions are released as in `limit_cycle`, at the end of pulses like the scene's own of several strengths, from each of
-    `starts` (states `(2n,)` in m and m/s, or trajectories), and from sixteen states in random directions. Several cycles may
+    `starts` (states `(2n,)` in m and m/s, or trajectories), and from 48 states in random directions. Several cycles may
     coexist; there may be others that no motion reached, and tori that could not be computed. `progress` as in `limit_cycle`.
 
     **Returns:** a list of `LimitCycle`, the one with the largest amplitude first; empty where all motions fade.
@@ -162,7 +162,7 @@ def _kicked(scene: Scene) -> list[Trajectory]:
 
 def _at_random(scene: Scene) -> Float[np.ndarray, "m 2n"]:
     """Deviations from sliding in random directions, in contact: there are cycles to which no load and no mode leads."""
-    count, n = 16, scene.structure.size
+    count, n = 48, scene.structure.size
     weights, (tangential, normal) = weights_of(scene.structure), contact_coordinates(scene.structure)
     fastest = np.max(np.atleast_1d(weights[n + tangential]) * np.abs(scene.belt_speed))
     # The same ones each time; of the size of motions as fast as the belt, and up to ten times as large.
