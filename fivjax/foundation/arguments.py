@@ -57,6 +57,25 @@ def real_number(
         raise ValueError(f"Argument `{name}` must be at most {bound}, but is {shown}.")
 
 
+def each_number(name: str, value, count: int, **bounds):
+    """One number, or one for each of `count` contacts; refuse anything else. A list for one contact is its number."""
+    if not is_known(value):
+        return value
+    array = numeric_array(name, value)
+    if array.shape == (1,) == (count,):
+        value = array = array[0]
+    if array.ndim == 0 or count == 1:
+        real_number(name, value, **bounds)
+        return value
+    if array.shape != (count,):
+        raise ValueError(
+            f"Argument `{name}` must be one number or hold one for each of the {count} contacts, but has shape {array.shape}."
+        )
+    for one in array:
+        real_number(name, one, **bounds)
+    return value
+
+
 def is_whole(value) -> bool:
     """Whether it is one whole number, of Python's or NumPy's; spans of time are made of those."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)

@@ -91,8 +91,8 @@ class Scene(eqx.Module):
         if isinstance(friction, FrictionPerContact) and count == 1:
             (friction,) = friction.laws
         arguments.instance("load", load, AbstractLoad, "a load, such as Pulse(force=100.0, p=1.2)")
-        _each_number("belt_speed", belt_speed, count)
-        _each_number("restitution", restitution, count, minimum=0, maximum=1)
+        belt_speed = arguments.each_number("belt_speed", belt_speed, count)
+        restitution = arguments.each_number("restitution", restitution, count, minimum=0, maximum=1)
         arguments.one_of("impact_law", impact_law, IMPACT_LAWS)
         _refuse_other_than_numbers("friction law", friction)
         _refuse_other_than_numbers("load", load)
@@ -224,22 +224,6 @@ def _refuse_other_than_numbers(what: str, part: eqx.Module) -> None:
                 "that field by `eqx.field(static=True)`; of a network, take numbers and functions apart by `eqx.partition(net, "
                 "eqx.is_array)`."
             )
-
-
-def _each_number(name: str, value, count: int, **bounds) -> None:
-    """Refuse anything but one number, or one for each contact."""
-    if not is_known(value):
-        return
-    array = arguments.numeric_array(name, value)
-    if array.ndim == 0 or count == 1:
-        arguments.real_number(name, value, **bounds)
-        return
-    if array.shape != (count,):
-        raise ValueError(
-            f"Argument `{name}` must be one number or hold one for each of the {count} contacts, but has shape {array.shape}."
-        )
-    for one in array:
-        arguments.real_number(name, one, **bounds)
 
 
 @returning_numpy

@@ -6,6 +6,7 @@ import pickle
 import re
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -260,6 +261,15 @@ def test_impact_laws_are_kept_by_replace(law):
     assert scene.replace(mu=0.1).impact_law == law
     # As an array of words gives it.
     assert repr(paper_scene_with(impact_law=np.array([law])[0]).impact_law) == repr(law)
+
+
+def test_lists_for_one_contact_are_its_own_values():
+    """So that what is written for any number of contacts runs for one, too."""
+    law = fj.Coulomb(0.2)
+    listed = fj.Scene(fj.belt_oscillator(), [law], [3.0], restitution=np.array([0.4]))
+    single = fj.Scene(fj.belt_oscillator(), law, 3.0, restitution=0.4)
+    assert eqx.tree_equal(listed, single)
+    assert eqx.tree_equal(listed.replace(belt_speed=[2.0]), single.replace(belt_speed=2.0))
 
 
 def test_replace_reaches_every_part_and_nothing_else():
