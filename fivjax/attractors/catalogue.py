@@ -48,8 +48,10 @@ class Attractors(NamedTuple):
         return cycle if before is None else before
 
     def add_torus(self, torus: Torus) -> None:
-        """Adds a torus unless a known one captures all of it: two motions on the same one may have been tried at once."""
-        if not any(np.all(one.tube.holds(torus.tube.states)) for one in self.tori):
+        """Adds a torus unless a known one captures most of it: two motions on the same one may have been tried at once, and on
+        one of more dimensions the states of neither are next to all of the other's.
+        """
+        if not any(np.mean(one.tube.holds(torus.tube.states)) > 0.5 for one in self.tori):
             self.tori.append(torus)
 
     def copy(self) -> "Attractors":

@@ -149,6 +149,16 @@ def test_motions_on_one_torus_that_are_tried_at_once_make_one():
     np.testing.assert_array_equal(known.tori[1].tube.states, 1.1 * states[:512])
 
 
+def test_motions_on_one_torus_of_more_dimensions_make_one():
+    """States that fill a band are not next to all of another motion's."""
+    known, states = Attractors.none(), wound(returns=1025)
+    band = states * (1 + 0.4 * np.random.default_rng(0).uniform(-1, 1, (len(states), 1)))
+    assert 0.6 < np.mean(Tube(band[:512], tube.RADIUS).holds(band[513:])) < 0.99
+    for own in (band[:512], band[513:], 2.0 * band[513:]):
+        known.add_torus(Torus(Tube(own, tube.RADIUS), 1.0, 0.1))
+    assert len(known.tori) == 2
+
+
 def circle(radius=0.5, count=STATES):
     """Weighted states (displacement, gap, velocity, rate of the gap) in contact on a closed curve, in no order."""
     angle = 2 * np.pi * GOLDEN * np.arange(count)
