@@ -58,7 +58,7 @@ class SmallestKick(NamedTuple):
 
     p: float  # of the smallest kick found that leads to a limit cycle
     duration: float  # of that kick, s
-    certified: float  # every kick with p between 1 and this slides for ever, for all durations within the bounds
+    certified: float  # every kick with p between 1 and this slides for ever, for all durations that are free
     proved_low: float  # a kick of the same duration with this p was proved to slide; NaN where p is its lower bound
     proved_high: float  # one with this p was proved to end on a limit cycle
     scene: Scene | None = None  # the one that was asked about
@@ -86,7 +86,7 @@ class SmallestKick(NamedTuple):
         found, certified = apart(self.p, self.certified, digits=9)
         return (
             f"smallest kick found: p = {found} for {self.duration:.6g} s leads to a limit cycle\n"
-            f"certified: every kick with p from 1 to {certified}, of durations within the bounds, slides for ever\n"
+            f"certified: every kick with p from 1 to {certified}, of the durations asked for, slides for ever\n"
             f"gap: {self.p - self.certified:.3g}; the bound is {100 * self.ratio:.3g} % of what was found"
         )
 
@@ -186,11 +186,10 @@ def smallest_kick(
         raise ValueError(
             'Argument `bounds` must have durations for a pulse that has none itself, such as {"duration": (0.0, 0.1)}.'
         )
-    unknown = sorted(set(given) - set(OF_KICK))
+    unknown = sorted(set(bounds) - set(free))
     if unknown:
-        raise ValueError(
-            f"Argument `bounds` must name what of a kick is free ({', '.join(OF_KICK)}), but has {unknown[0]!r}."
-        )
+        rule = f"Argument `bounds` must name what is free in `over` ({', '.join(free)}), but has {unknown[0]!r}."
+        raise ValueError(rule + (" Name it in `over`, too." if unknown[0] in OF_KICK else ""))
     given = {name: _bounds(name, pair) for name, pair in given.items()}
     shortest, longest = given["duration"] if "duration" in free else (own, own)
     certified = 1.0 + certified_excess(scene, shortest, longest)

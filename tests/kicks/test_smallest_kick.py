@@ -186,6 +186,14 @@ def test_what_was_found_is_saved_with_units_and_its_scene(found, tmp_path):
         fj.save(found._replace(scene=None), tmp_path / "none.nc")
 
 
+def test_bounds_of_what_is_not_free_are_refused():
+    """They were ignored, and what was certified for the scene's own duration was said of all within the bounds."""
+    with pytest.raises(ValueError, match=r"is free in `over` \(p\), but has 'duration'\. Name it in `over`, too"):
+        fj.smallest_kick(SCENE, over=["p"], bounds={"p": (1.0, 2.0), "duration": (0.0, 0.2)})
+    with pytest.raises(ValueError, match=r"is free in `over` \(p, duration\), but has 'force'\.$"):
+        fj.smallest_kick(SCENE, bounds={"force": (1.0, 2.0)})
+
+
 def test_states_and_histories_are_refused_what_they_do_not_have():
     with pytest.raises(ValueError, match="must name nothing"):
         fj.smallest_kick(SCENE, over="state", bounds={"p": (1.0, 2.0)})
