@@ -342,7 +342,12 @@ def _closed_from(scene: Scene, start) -> LimitCycle | None:
         amid = np.mean(start.points, axis=0) - start.deviation
         starts.insert(0, dataclasses.replace(start, state=start.state + amid))
     for begin in starts:
-        guess, crossings = _guess(maps, scene, begin)
+        try:
+            guess, crossings = _guess(maps, scene, begin)
+        except NoLimitCycle:
+            if begin is start:
+                raise
+            continue
         for count in crossings:
             closed = close_near(maps, guess, count)
             if closed is not None and maps.moves(np.zeros(1, int), np.asarray(closed.point.y)[None])[0]:

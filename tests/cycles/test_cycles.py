@@ -254,6 +254,13 @@ def test_above_the_speed_where_it_loses_stability_the_cycle_is_a_torus():
     equilibrium = np.append(reference.linear(reference.of_scene(scene)).q_eq, np.zeros(3))
     away = np.linalg.norm(np.asarray(scene.structure.weights) * (torus.state - equilibrium) - path, axis=1).min()
     assert away < 1e-3 * size
+    # It winds around the cycle that it came from, which is found from its middle; from one of its points, if need be.
+    amid = np.mean(path, axis=0)
+    for start in (torus, dataclasses.replace(torus, points=np.full_like(torus.points, np.nan))):
+        inner = fj.limit_cycle(scene, start)
+        assert inner.kind == "periodic" and inner.unstable_directions == 2
+        beside = np.asarray(scene.structure.weights) * inner.points - amid
+        assert np.linalg.norm(beside) < 0.7 * np.linalg.norm(np.std(path, axis=0))
 
 
 @pytest.mark.parametrize("harmonic", [1, 2, 3])
