@@ -155,15 +155,19 @@ def _manifold(axis: np.ndarray, verdict: np.ndarray, verdicts) -> np.ndarray:
     low, high = np.full((2, len(axis)), np.nan)
     for row, values in enumerate(verdict):
         if len(brackets := _changes(axis, values)):
-            low[row], high[row] = brackets[np.argmin(np.abs(np.sum(brackets, axis=1)))]
+            low[row], high[row] = _closest_to_zero(brackets)
     known = np.flatnonzero(np.isfinite(low))
     for _ in range(rounds if len(known) else 0):
         inner = np.linspace(low[known], high[known], inside + 2, axis=1)
         found = verdicts(np.broadcast_to(axis[known, None], inner.shape), inner)
         for row, places, values in zip(known, inner, found, strict=True):
             if len(brackets := _changes(places, values)):
-                low[row], high[row] = brackets[0]
+                low[row], high[row] = _closest_to_zero(brackets)
     return 0.5 * (low + high)
+
+
+def _closest_to_zero(brackets: np.ndarray) -> np.ndarray:
+    return brackets[np.argmin(np.abs(np.sum(brackets, axis=1)))]
 
 
 def _changes(places: np.ndarray, verdict: np.ndarray) -> np.ndarray:

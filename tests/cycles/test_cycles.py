@@ -256,7 +256,7 @@ def test_above_the_speed_where_it_loses_stability_the_cycle_is_a_torus():
     assert away < 1e-3 * size
     # It winds around the cycle that it came from, which is found from its middle; from one of its points, if need be.
     amid = np.mean(path, axis=0)
-    for start in (torus, dataclasses.replace(torus, points=np.full_like(torus.points, np.nan))):
+    for start in (torus, dataclasses.replace(torus, points=1e15 * torus.points)):
         inner = fj.limit_cycle(scene, start)
         assert inner.kind == "periodic" and inner.unstable_directions == 2
         beside = np.asarray(scene.structure.weights) * inner.points - amid
