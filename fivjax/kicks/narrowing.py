@@ -153,7 +153,10 @@ def least_crossings(kicked: Kicked, p: Float[np.ndarray, " kicks"], tolerance: f
         fine, _ = own.narrowed(*scan.brackets, tolerance)
         for whole, part in zip(found, fine, strict=True):
             whole[left] = part
-        left, begin = left[np.isnan(scan.seen.high)], end - 1
+        go_on = np.isnan(scan.seen.high)
+        # From the last kick that is known to slide: on an undecided one no bracket rests.
+        slides = np.flatnonzero(np.all(scan.verdicts[go_on] == Verdict.SLIDING, axis=0))
+        left, begin = left[go_on], begin + int(slides[-1]) if len(slides) else begin
         if not len(left) or end >= len(p) or np.sum(np.isfinite(found.middle)) >= wanted:
             break
     return found

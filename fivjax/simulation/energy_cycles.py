@@ -61,7 +61,8 @@ def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
     contacts are also given one by one (`stick_work_0`, …). Coordinates `cycle_start` and `cycle_end` in s. Exact for
     `EventExact`; for other methods, the ends of cycles have the error of the method.
 
-    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
+    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger, or whose contacts are
+    directions that are no coordinates.
 
     **Example:**
 
@@ -112,7 +113,8 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
     zero except for re-contacts; and `mechanical_energy` just after the event, in J. Exact for `EventExact`; for other methods,
     times have the error of the method.
 
-    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
+    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger, or whose contacts are
+    directions that are no coordinates.
 
     **Example:**
 

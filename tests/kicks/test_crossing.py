@@ -1,6 +1,7 @@
 """Critical kicks say what is proved: brackets with both ends confirmed, and no number across undecided trajectories."""
 
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from fivjax.foundation import progress
 from fivjax.kicks import narrowing
 from fivjax.maps import bistability, engine, jobs
 from fivjax.maps.crossing import first_crossings
+from fivjax.maps.engine import RunOptions
 from fivjax.maps.results import not_run
 
 KICKS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
@@ -104,6 +106,21 @@ def test_undecided_trajectories_stop_the_narrowing_and_leave_no_number(paper_sce
     found = found_by(monkeypatch, paper_scene, verdict_of)
     assert np.isnan(found["p_crit"]) and np.isnan(found["p_crit_error"])
     assert 1.3 <= found["p_crit_low"] <= 1.33 and 1.57 <= found["p_crit_high"] <= 1.6
+
+
+def test_a_part_of_a_scan_begins_at_a_kick_that_slides(paper_scene, monkeypatch):
+    """It began at the last kick of the part before; where that was undecided, and the next one squealed, there was no bracket."""
+
+    def verdict_of(p, label):
+        return -1 if label == "scan" and 1.45 < p < 1.55 else int(p > 1.52)
+
+    monkeypatch.setattr(narrowing, "run_to_verdict", told(verdict_of))
+    options, limits = RunOptions("scan", progress=False), SimpleNamespace(energy=False)
+    columns = {"duration": np.array([0.1, 0.2])}
+    kicked = narrowing.Kicked(paper_scene, columns, None, limits, options, {})  # type: ignore[arg-type]
+    kicks = np.linspace(1.0, 5.0, 41)
+    assert kicks[kicks.size // 8] == 1.5  # the last kick of the first part
+    np.testing.assert_allclose(narrowing.least_crossings(kicked, kicks, 1e-5, 2).middle, 1.52, atol=1e-5)
 
 
 @pytest.mark.parametrize("at_the_end", [0, -1])
