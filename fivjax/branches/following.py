@@ -197,7 +197,9 @@ class _Front:
         most_gaps = 16
         self.gaps += 1
         before, last = [self.start, self.start, *self.points][-2:]
-        onwards = np.sign(last.cycle.parameter - before.cycle.parameter) or self.sense
+        moved = last.cycle.parameter - before.cycle.parameter
+        # What begins at a special point has not moved by more than rounding.
+        onwards = np.sign(moved) if abs(moved) > SHORTEST * self.family.scale else self.sense
         ways = (onwards, -onwards) if self.points else (self.sense,)
         for way, near in itertools.product(ways, (last, before)) if self.gaps <= most_gaps else ():
             # At a special point rounding tells how the motion goes on.

@@ -134,7 +134,9 @@ class Curve:
         """The cycle near a guess at this value of the parameter."""
         u, normal = guess.copy(), np.zeros_like(guess)
         u[-1], normal[-1] = parameter / self.scales[-1], 1.0
-        return self.corrected(u, normal)
+        found = self.corrected(u, normal)
+        # Exactly this value, which its share of the scale may round: it may be a bound.
+        return None if found is None else found._replace(parameter=parameter)
 
 
 # A system of so many equations or more, of a cycle of twenty phases, is taken for sparse: each phase has to do with itself, the

@@ -83,15 +83,19 @@ class FreeParameters(eqx.Module):
 
     def unbounded(self, values) -> np.ndarray:
         """The inverse of `values`; numbers outside the bounds are first moved inside."""
+        # So far inside, as a share; and so near to a bound that `values` still has eight digits.
+        moved, nearest = 1e-3, 1e-8
         found = []
         for k, kind in enumerate(self.kinds):
-            value = float(values[k])
+            value, low = float(values[k]), self.lower[k]
             if kind == "both":
-                width = self.upper[k] - self.lower[k]
-                share = np.clip((value - self.lower[k]) / width, 1e-3, 1 - 1e-3)
+                width = self.upper[k] - low
+                least = nearest if low < value < self.upper[k] else moved
+                share = np.clip((value - low) / width, least, 1 - least)
                 found.append(np.log(share / (1 - share)))
             elif kind == "lower":
-                found.append(np.log(max(value - self.lower[k], 1e-3 * self.size[k]) / self.size[k]))
+                share = (value - low) / self.size[k]
+                found.append(np.log(max(share, nearest if value > low else moved)))
             else:
                 found.append(value / self.size[k])
         return np.array(found)

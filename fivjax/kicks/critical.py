@@ -78,7 +78,7 @@ def critical_perturbation(
       apart than the tolerance, and if a trajectory that was run again contradicts the scan. If already the lower end of the
       range leads to a limit cycle, `p_crit` is that end, and `p_crit_low` is NaN;
     - `p_crit_error`: half the distance of the two; for methods with a fixed step plus the change of `p_crit` when the step is
-      doubled;
+      doubled, and infinite where nothing near it is found then;
     - `crossings`: the number of changes in the scan; `only_crossing`: whether there was at most one, and no undecided
       trajectory that might hide another.
 
@@ -172,10 +172,19 @@ def _stepping_error(
     method = kicked.method
     if not isinstance(method, WhereSwitched):
         return 0.0
-    around = np.maximum(fine.brackets + p_step * np.array([-1.0, 1.0]), 0.0)
-    unknown = np.full(around.shape, Verdict.UNDECIDED)
-    coarse, _ = kicked._replace(method=WhereSwitched(method.solver, 2 * method.dt)).narrowed(around, unknown, tolerance)
-    return np.where(np.isnan(fine.low), 0.0, np.abs(coarse.middle - fine.middle))
+    coarser, moved = kicked._replace(method=WhereSwitched(method.solver, 2 * method.dt)), np.zeros(len(fine.middle))
+    left = np.flatnonzero(np.isfinite(fine.low))
+    for away in (1, 8, 64):
+        around = np.maximum(fine.brackets[left] + away * p_step * np.array([-1.0, 1.0]), 0.0)
+        unknown = np.full(around.shape, Verdict.UNDECIDED)
+        coarse, _ = coarser.only(left).narrowed(around, unknown, tolerance)
+        # Where the lower end squeals, the crossing lies below it.
+        moved[left] = np.where(np.isfinite(coarse.low), np.abs(coarse.middle - fine.middle[left]), np.nan)
+        left = left[np.isnan(moved[left])]
+        if not len(left):
+            break
+    moved[left] = np.inf
+    return moved
 
 
 def _energies_of_the_kick(kicked: Kicked, p: Float[np.ndarray, " r"]) -> dict[str, Float[np.ndarray, " r"]]:

@@ -210,11 +210,13 @@ def smallest_kick(
     p, duration, best = tried[0]
     if "duration" in free:
         p, duration = min(_descended(scene, q, d, shortest, longest) for q, d, _ in tried)
+    # A descent may lead below the bound of p.
+    around = max(p - 1e-4, low), max(p, low) + 1e-4
     at = critical_perturbation(
-        scene, duration=[duration], p_range=(p - 1e-4, p + 1e-4), p_step=1e-4, derivatives=True, progress=False
+        scene, duration=[duration], p_range=around, p_step=5e-5, derivatives=True, progress=False
     ).isel(duration=0)
-    # Where its lower end squeals already, the guess was too far off to say how small a kick may be.
-    if np.isfinite(at["p_crit_low"]):
+    # Where its lower end squeals already, and is no bound, the guess was too far off to say how small a kick may be.
+    if np.isfinite(at["p_crit_low"]) or float(at["p_crit"]) == low:
         p, proved = float(at["p_crit"]), (float(at["p_crit_low"]), float(at["p_crit_high"]))
     else:
         (p, duration, _), proved = tried[0], (float(seen.low[best]), float(seen.high[best]))

@@ -413,6 +413,14 @@ def test_a_closed_curve_is_passed_once_wherever_it_begins(belt_speed):
         np.testing.assert_allclose(sorted(found), wanted, atol=2e-9)
 
 
+@pytest.mark.parametrize("bounds", [(0.2299, 0.233), (0.17, 0.2178)])
+def test_a_branch_from_a_bound_has_that_once_and_no_point_beyond(bounds):
+    """A bound that its share of the scale does not give back was met as another point, a rounding beside it."""
+    scene = paper(1.0, 0.2299 if bounds[0] == 0.2299 else 0.2178)
+    found = fj.continue_cycle(scene, "mu", bounds, points=8)["parameter"].values
+    assert bounds[0] <= found[0] and found[-1] <= bounds[1] and np.all(np.diff(found) > 1e-6)
+
+
 @pytest.mark.slow
 def test_a_closed_curve_is_passed_once_though_one_way_along_it_ends():
     """Backwards no cycle is found beyond a change of contact modes, to which the other way comes, and goes on."""

@@ -172,6 +172,19 @@ def test_of_contacts_that_move_alike_no_special_point_is_made_of_the_order_of_th
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("which", ["mu_0", "mu_1"])
+def test_from_contacts_that_move_alike_a_branch_goes_both_ways(which):
+    """Where they are alike their events change order, and the branch begins there: it went the same way twice."""
+    scene = fj.Scene(coupled(2), [fj.Coulomb(0.22)] * 2, np.ones(2), fj.Pulse(100.0, 1.2))
+    branch = fj.continue_cycle(scene, which, (0.2195, 0.2205))
+    places = branch["parameter"].values
+    assert (branch.attrs["begins"], branch.attrs["ends"]) == tuple(
+        f"The bound {which} = {end} is reached." for end in (0.2195, 0.2205)
+    )
+    assert (places[0], places[-1]) == (0.2195, 0.2205) and np.all(np.diff(places) > -1e-12)
+
+
+@pytest.mark.slow
 def test_the_state_at_an_edge_of_static_friction_is_on_the_cycle():
     """Wherever rounding sends the motion there: with a little less static friction it goes round."""
     matrices = [np.kron(np.eye(2), matrix) for matrix in fj.belt_oscillator().matrices[:3]]

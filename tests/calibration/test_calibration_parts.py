@@ -260,6 +260,13 @@ def test_bounds_are_those_given_where_the_scene_takes_them():
     assert float(FreeParameters(negative, ["coupling"], {"coupling": (-0.5, 0.5)}).lower[0]) == -0.5
 
 
+@pytest.mark.parametrize("bounds", [(0.0, 1e9), (99_990.0, np.inf), (-1e9, 1e5 + 1e-2)])
+def test_a_guess_far_from_one_of_its_bounds_or_near_one_is_not_moved(bounds):
+    """Of bounds from 0 to 1e9, a guess of 1e5 was moved to 1e6, from which no limit cycle was found."""
+    free = FreeParameters(paper(), ["k1"], {"k1": bounds})
+    np.testing.assert_allclose(free.values(free.unbounded([1e5])), 1e5, rtol=1e-7)
+
+
 def test_bounded_parameters_stay_inside_and_come_back():
     free = FreeParameters(paper(), ["mu", "k1", "theta"], {"mu": (0.1, 0.4)})
     values = [0.15, 7e4, -0.02]

@@ -61,13 +61,13 @@ def test_what_was_not_computed_proves_nothing():
     assert np.isnan(found.low[0]) and found.high[0] == 1.1
 
 
-def told(verdict_of):
-    """In place of `run_to_verdict`: verdicts as a function of the kick and of the label of the batch."""
+def told(verdict_of, by_method=False):
+    """In place of `run_to_verdict`: verdicts as a function of the kick and of the label of the batch, and of the method."""
 
     def run(scene, trajectories, method, limits, means, **_):
-        kicks = trajectories.columns()["p"]
+        kicks, of_method = trajectories.columns()["p"], {"method": method} if by_method else {}
         verdicts = not_run(len(kicks), limits.energy)
-        verdicts.verdict[:] = [verdict_of(p, means.label) for p in kicks]
+        verdicts.verdict[:] = [verdict_of(p, means.label, **of_method) for p in kicks]
         return verdicts
 
     return run
@@ -138,6 +138,20 @@ def test_the_lower_end_is_the_critical_kick_where_all_of_them_squeal(paper_scene
     assert found["p_crit"] == 1.0 and np.isnan(found["p_crit_low"]) and found["p_crit_error"] == 0
     found = found_by(monkeypatch, paper_scene, lambda p, _: 1 if p > 1.0 else -1)
     assert np.isnan(found["p_crit"]) and np.isnan(found["p_crit_error"])
+
+
+@pytest.mark.parametrize(("coarser", "error"), [(1.26, 0.0101), (1.05, 0.2001), (2.95, 1.7001), (np.inf, np.inf)])
+def test_what_doubled_steps_change_is_sought_further_away_where_it_is_much(paper_scene, monkeypatch, coarser, error):
+    """It was NaN, or the distance of the end to which it was sought."""
+
+    def verdict_of(p, _, method):
+        return int(p > (1.25 if method.dt == 1e-4 else coarser))
+
+    monkeypatch.setattr(narrowing, "run_to_verdict", told(verdict_of, by_method=True))
+    method = fj.WhereSwitched(dt=1e-4)
+    found = fj.critical_perturbation(paper_scene, p_range=(1.0, 3.0), p_step=0.1, method=method, tolerance=2e-4)
+    assert float(found["p_crit"].squeeze()) == pytest.approx(1.25, abs=1e-4)
+    assert float(found["p_crit_error"].squeeze()) == pytest.approx(error, abs=3e-4)
 
 
 def test_undecided_trajectories_elsewhere_might_hide_another_crossing(paper_scene, monkeypatch):

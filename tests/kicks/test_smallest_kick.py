@@ -224,6 +224,13 @@ def test_where_the_least_kick_of_the_bounds_squeals_it_is_the_smallest_and_none_
 
 
 @pytest.mark.slow
+def test_a_search_over_durations_stays_within_the_bounds_of_p():
+    """It went on to 1.21397."""
+    found = fj.smallest_kick(SCENE.replace(mu=0.2), bounds={"p": (1.215, 3.0), "duration": (0.0, 0.05)})
+    assert found.p == found.proved_high == 1.215 and np.isnan(found.proved_low) and 0 < found.duration <= 0.05
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("over", ["state", "history"])
 def test_the_smallest_state_and_history_are_certified_to_more_than_half(over):
     found = fj.smallest_kick(SCENE, over=over)
