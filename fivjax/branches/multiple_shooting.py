@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Status
@@ -144,6 +144,7 @@ class PhaseImages(NamedTuple):
     guard_y: Float[np.ndarray, "k state"]
     guard_h: Float[np.ndarray, " k"]
     guard_parameter: Float[np.ndarray, " k"]
+    rebounds: Bool[np.ndarray, " k"]  # whether a landing at the end leaves a velocity away from the belt
 
 
 def phases_around(segments: PeriodSegments) -> Phases | None:
@@ -213,10 +214,12 @@ def images_along(scene: Scene, directions: Sequence[Scene], modes, following, y,
     along = of_parameters, units[:size], units[size], None
     found = _image.derived((scene,), along, own=own, by_kernel=by_kernel)
     ((y, guard), _), ((to, of_guard), _) = found
+    restitution = np.broadcast_to(np.asarray(scene.restitution), len(modes[0].status))
+    rebounds = np.array([restitution[mode.ending // 2] > 0 for mode in modes])
 
     def of_one(column: int) -> PhaseImages:
         parts = y, guard, to[..., :size], to[..., size], to[..., column]
-        parts = *parts, of_guard[:, :size], of_guard[:, size], of_guard[:, column]
+        parts = *parts, of_guard[:, :size], of_guard[:, size], of_guard[:, column], rebounds
         return PhaseImages(*(part[:count] for part in parts))
 
     return list(map(of_one, range(size + 1, total)))

@@ -181,12 +181,12 @@ def _least_solution(rows: Float[np.ndarray, "m-1 m"], right: Float[np.ndarray, "
     return _solution(np.vstack([rows, _null_vector(rows, None)]), np.append(right, 0.0))
 
 
-def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
+def roots_at_start(modes: tuple[Mode, ...], k: int, rebounds: bool = True) -> int:
     """The multiplicity of the root that the guard which ends a phase has at the phase's own start.
 
     A slip speed after a reversal of slip has a simple root there, after sticking a double one; a gap after an impact, its own
     or one that has lifted it, a simple one, after lift-off a triple one. A duration of zero would always solve their equations,
-    so these roots are divided out.
+    so these roots are divided out. After an impact of its own the root is double unless the contact `rebounds`.
     """
     before, own = modes[k - 1], modes[k]
     if own.lands and before.lands and before.status[own.ending // 2] != Status.DETACH:
@@ -200,7 +200,7 @@ def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
             return 1
         return 2 if was == Status.STICK and len(modes) > 1 else 0
     if status == Status.DETACH:
-        return 1 if was == Status.DETACH else 3
+        return 3 if was != Status.DETACH else 1 if rebounds else 2
     return 0
 
 
@@ -231,7 +231,7 @@ def assembled(found: PhaseImages, phases: Phases) -> tuple[np.ndarray, np.ndarra
 
 
 def _without_roots_at_start(found: PhaseImages, phases: Phases) -> PhaseImages:
-    power = np.array([roots_at_start(phases.modes, k) for k in range(len(phases.modes))])
+    power = np.array([roots_at_start(phases.modes, k, found.rebounds[k - 1]) for k in range(len(phases.modes))])
     h = phases.h / phases.period
     # Below these a guard is a rounding error; that of a rebound, which begins on the belt, has smaller ones.
     least = np.where([mode.lands for mode in phases.modes] & (power == 1), 1e-13, 1e-9)

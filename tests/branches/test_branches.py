@@ -421,6 +421,18 @@ def test_a_branch_from_a_bound_has_that_once_and_no_point_beyond(bounds):
     assert bounds[0] <= found[0] and found[-1] <= bounds[1] and np.all(np.diff(found) > 1e-6)
 
 
+@pytest.mark.parametrize("theta", [0.0128, 0.0129])
+def test_a_flight_after_a_landing_without_rebound_begins_at_the_same_place_from_both_sides(theta):
+    """Without restitution the gap has a double root where such a flight begins. From the side of the flight, a cycle without
+    it was taken for the last one, 4e-8 beyond the grazing, of which no name and no derivative were known.
+    """
+    branch = fj.continue_cycle(paper(1.0, 0.2).replace(theta=theta), "theta", (0.0127, 0.01295), derivatives=True)
+    (k,) = np.flatnonzero(branch["special"] != "")
+    assert branch["special"].values[k] == f"grazing of N: impact {'inserted' if theta == 0.0128 else 'removed'}"
+    assert float(branch["parameter"][k]) == pytest.approx(0.0128574450956546, rel=1e-12)
+    assert float(branch["d_special"].sel(of="belt_speed")[k]) == pytest.approx(-0.01080234, rel=1e-6)
+
+
 @pytest.mark.slow
 def test_a_closed_curve_is_passed_once_though_one_way_along_it_ends():
     """Backwards no cycle is found beyond a change of contact modes, to which the other way comes, and goes on."""

@@ -41,6 +41,7 @@ def test_a_guard_has_roots_at_the_start_of_a_phase_only_if_its_contact_begins_so
     )
     # An impact after a lift-off, one after an impact; nothing of the second contact has begun where the first lands.
     assert [roots_at_start(modes, k) for k in range(5)] == [3, 1, 0, 0, 0]
+    assert [roots_at_start(modes, k, rebounds=False) for k in range(5)] == [3, 2, 0, 0, 0]
     # Slip after sticking.
     assert roots_at_start((mode(SLIDE, STICK, 2), mode(SLIDE, SLIDE, 3)), 1) == 2
     assert roots_at_start((mode(SLIDE, SLIDE, AT_SECTION),), 0) == 0
