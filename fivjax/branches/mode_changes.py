@@ -61,13 +61,14 @@ def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray
     valid, ahead = bracket.valid, bracket.ahead
     if ahead is None:
         return None
-    # Events of two contacts that move alike are always at once.
-    gone = [k for k in valid.phases.lasting() if ahead.phases.h[k] <= 0 and not here.cycle.phases.is_at_once(k)]
+    # Events of two contacts that move alike are always at once. What was no short rebound may be as short as one by now.
+    before = here.cycle.phases
+    gone = [k for k in before.lasting() if ahead.phases.h[k] <= 0 and not before.is_at_once(k)]
     if gone:
         return _reordered(family, curve, valid, gone[0]) or _removed(bracket, gone[0])
     if turned_back := _missed(bracket, ahead):
         return turned_back, None
-    shrinks = _shrinking(valid.phases, here.cycle.phases)
+    shrinks = _shrinking(valid.phases, before)
     return (
         _inserted(bracket, ahead)
         or (None if shrinks is None else _removed(bracket, shrinks, seen=True))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.branches import continuation, following, pseudo_arclength, special_derivatives, verification
+from fivjax.branches import continuation, following, mode_changes, pseudo_arclength, special_derivatives, verification
 from fivjax.branches.multiple_shooting import Mode
 from fivjax.branches.special_points import pairing
 from fivjax.model import own_structures
@@ -421,11 +421,14 @@ def test_a_branch_from_a_bound_has_that_once_and_no_point_beyond(bounds):
     assert bounds[0] <= found[0] and found[-1] <= bounds[1] and np.all(np.diff(found) > 1e-6)
 
 
-@pytest.mark.parametrize("theta", [0.0128, 0.0129])
-def test_a_flight_after_a_landing_without_rebound_begins_at_the_same_place_from_both_sides(theta):
+@pytest.mark.parametrize(("theta", "further"), [(0.0128, 0), (0.0129, 0), (0.0129, 10)])
+def test_a_flight_after_a_landing_without_rebound_begins_at_the_same_place_from_both_sides(monkeypatch, theta, further):
     """Without restitution the gap has a double root where such a flight begins. From the side of the flight, a cycle without
-    it was taken for the last one, 4e-8 beyond the grazing, of which no name and no derivative were known.
+    it was taken for the last one, 4e-8 beyond the grazing, of which no name and no derivative were known. Nor were they where
+    the flight was halved to less than counts as a rebound.
     """
+    halved = mode_changes._Bracket.halved
+    monkeypatch.setattr(mode_changes._Bracket, "halved", lambda self, times: halved(self, times + further))
     branch = fj.continue_cycle(paper(1.0, 0.2).replace(theta=theta), "theta", (0.0127, 0.01295), derivatives=True)
     (k,) = np.flatnonzero(branch["special"] != "")
     assert branch["special"].values[k] == f"grazing of N: impact {'inserted' if theta == 0.0128 else 'removed'}"
