@@ -195,8 +195,9 @@ class FitSearch:
         x0, about = candidate
         at = self.problem.compared(x0, x0, share, about)
         self.evaluations += 1
-        found, left_out = Minimum(x0, at, False, 1), at.about.touched
+        found = Minimum(x0, at, False, 1)
         for _ in range(MOST_ROUNDS):
+            left_out = found.at.about.touched
             problem = self.problem.without(left_out)
             found = minimise(
                 lambda x, about, problem=problem: problem.compared(x, x0, share, about),
@@ -207,11 +208,10 @@ class FitSearch:
                 problem.is_scene,
             )
             self.evaluations += found.evaluations
-            now = found.at.about.touched
+            found, now = found._replace(left_out=left_out), found.at.about.touched
             if not any(np.any(np.asarray(new) & ~np.asarray(old)) for new, old in zip(now, left_out, strict=True)):
                 break
-            left_out = now
-        return found._replace(left_out=left_out)
+        return found
 
     def compared_numbers(self, found: Minimum) -> float:
         """The number of measured numbers that a fit compared."""
