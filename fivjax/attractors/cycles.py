@@ -34,10 +34,9 @@ class Recurrence(NamedTuple):
 
     def is_met(self, missed: Float[np.ndarray, " m"], lag: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
         """Which motions come back, if they miss their start by such shares of their size after so many crossings."""
-        if self.settled:
-            return missed <= 1e-3
         # After many crossings any motion on a torus comes back nearly.
-        return missed <= np.where(lag > CROSSINGS, 0.02, self.nearly)
+        few, many = (1e-3, 1e-4) if self.settled else (self.nearly, 0.02)
+        return missed <= np.where(lag > CROSSINGS, many, few)
 
     def attracts_soon(self, multiplier: float, crossings: int) -> bool:
         """Whether a cycle is one that motions come to soon. One of many crossings that attracts weakly lies on a torus that is
